@@ -120,12 +120,16 @@ def test_no_import_leads_upward_within(part: str) -> None:
     assert not breaches(upward, part)
 
 
-def test_core_imports_only_numpy_and_the_standard_library_without_clock_and_processes() -> None:
+def test_core_imports_only_numpy_and_the_standard_library_without_clock_and_processes_and_nodes_alone_rclpy() -> None:
+    def roots_of(module: str) -> set[str]:
+        return {name.partition(".")[0] for name in imported(module) - ours(module)}
+
     def forbidden(module: str) -> set[str]:
-        roots = {name.partition(".")[0] for name in imported(module) - ours(module)}
+        roots = roots_of(module)
         return roots - {"numpy", *sys.stdlib_module_names} | roots & {"time", "socket", "subprocess", "threading"}
 
     assert not breaches(forbidden, "core")
+    assert all(is_in(module, "nodes") for module in breaches(lambda module: roots_of(module) & {"rclpy"}))
 
 
 def test_no_module_imports_itself_by_a_circle() -> None:
@@ -133,11 +137,6 @@ def test_no_module_imports_itself_by_a_circle() -> None:
     while leaves := {module for module, needs in below.items() if not needs & below.keys()}:
         below = {module: needs for module, needs in below.items() if module not in leaves}
     assert not below
-
-
-def test_only_nodes_import_rclpy() -> None:
-    users = {module for module in MODULES if any(is_in(name, "rclpy") for name in imported(module))}
-    assert not [module for module in users if not is_in(module, "nodes")]
 
 
 def test_only_tools_print() -> None:

@@ -1,17 +1,11 @@
 # Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
 """An arm carried with a motor, and with a term, that another distribution provides: test/support/our_lab.
 
-    PYTHONPATH=test/support/our_lab python -m test.core.test_added_motor
-
-It is a process of its own, because entry points are looked up once. Prints what came of it as JSON.
+Entry points are looked up once, and so forgotten before and after.
 """
 
 from __future__ import annotations
 
-import json
-import os
-import subprocess
-import sys
 from typing import Any
 
 import numpy as np
@@ -60,30 +54,30 @@ def push(**given: Any) -> tuple[list[str], list[float]]:
     return arms[0].terms.active, np.subtract(*torques).tolist()
 
 
-def test_a_laboratory_s_own_motor_and_term_need_no_fork_and_all_bounds_hold() -> None:
-    path = os.pathsep.join((str(ROOT / "test" / "support" / "our_lab"), os.environ.get("PYTHONPATH", "")))
-    command, environment = [sys.executable, "-m", __name__], {**os.environ, "PYTHONPATH": path}
-    output = subprocess.run(command, cwd=ROOT, env=environment, capture_output=True, text=True, check=True).stdout
-    assert json.loads(output) == {
+def test_a_laboratory_s_own_motor_and_term_need_no_fork_and_all_bounds_hold(
+    monkeypatch: pytest.MonkeyPatch, request: pytest.FixtureRequest
+) -> None:
+    for found in (others, installed):
+        found.cache_clear()
+        request.addfinalizer(found.cache_clear)
+    carry(motor=["AK60-6"] * 4)
+    arm = {"use_imu": False, "max_effort": [9.0] * 4}
+    assert push(**arm)[0] == []
+    assert others.cache_info().misses == installed.cache_info().misses == 0  # our motors alone: none is looked up
+    monkeypatch.syspath_prepend(ROOT / "test" / "support" / "our_lab")
+    assert carry(motor=["OUR-1", "AK80-9", "OUR-1", "AK60-6"], wire_format=["ours", "mit", "ours", "mit_v3"]) == {
         "on": [True] * 4,
         "off": True,
         "ignored": {},
         # less than half a turn of the rotor at the output: 9 degrees
-        "home_tolerance": pytest.approx([0.15, 0.34, 0.15, 0.50]),
+        "home_tolerance": pytest.approx((0.15, 0.34, 0.15, 0.50)),
         "peak": [50.0, 18.0, 50.0, 9.0],
         "rotors": [4.0e-3, 4.9e-3, 4.0e-3, 8.8e-4],
         "most": [100.0, 40.0, 100.0, 40.0],
         "simulated": ["OurSimulatedMotor", "SimulatedMotor", "OurSimulatedMotor", "SimulatedMotor"],
-        "is_lazy": True,  # a start with our motors alone looks up no entry point
-        # within the bound of all terms together, 2 Nm
-        "pushed": [["our_push"], [0.5, 0.0, 2.0, pytest.approx(-1.0)]],
     }
-
-
-if __name__ == "__main__":
-    before = others.cache_info().misses
-    carry(motor=["AK60-6"] * 4)
-    arm = {"use_imu": False, "max_effort": [9.0] * 4}
-    is_lazy = push(**arm)[0] == [] and others.cache_info().misses == before and not installed.cache_info().misses
-    ours = carry(motor=["OUR-1", "AK80-9", "OUR-1", "AK60-6"], wire_format=["ours", "mit", "ours", "mit_v3"])
-    print(json.dumps({**ours, "is_lazy": is_lazy, "pushed": push(**arm, **{"our_push.effort": [0.5, 0.0, 2.5, -1.0]})}))
+    # within the bound of all terms together, 2 Nm
+    assert push(**arm, **{"our_push.effort": [0.5, 0.0, 2.5, -1.0]}) == (
+        ["our_push"],
+        pytest.approx([0.5, 0.0, 2.0, -1.0]),
+    )

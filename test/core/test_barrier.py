@@ -86,14 +86,12 @@ def test_only_what_turns_faster_than_people_shake_gets_less_damping(frequency, l
 
 def test_what_vibrates_without_damping_keeps_its_own_and_the_brake_of_a_driven_joint_stays():
     arm, tau = barrier(), (3.0,) * 4
-    for cycle in range(100):
-        arm.damping(0.01, joints(velocity=0.5 * (-1.0) ** (cycle // 4)), HEARD, NOTHING, NOTHING, is_late=False)
-    assert arm.damping(0.01, joints(velocity=0.0), HEARD, NOTHING, (DAMPING,) * 4, is_late=False) == (DAMPING,) * 4
-    for cycle in range(100):
-        way = (-1.0) ** (cycle // 4)
-        arm.damping(0.01, joints(velocity=0.5 * way), HEARD, NOTHING, (DAMPING,) * 4, is_late=False)
-    driven = arm.damping(0.1, joints(velocity=FULL), HEARD, tau, (DAMPING,) * 4, is_late=False)
-    assert min(driven) >= 3.0 / FULL - 1e-9
+    for asked, speed, effort, dt in ((NOTHING, 0.0, NOTHING, 0.01), ((DAMPING,) * 4, FULL, tau, 0.1)):
+        for cycle in range(100):
+            way = (-1.0) ** (cycle // 4)
+            arm.damping(0.01, joints(velocity=0.5 * way), HEARD, NOTHING, asked, is_late=False)
+        damping = arm.damping(dt, joints(velocity=speed), HEARD, effort, (DAMPING,) * 4, is_late=False)
+        assert damping == (DAMPING,) * 4 if not any(asked) else min(damping) >= 3.0 / FULL - 1e-9
 
 
 @pytest.mark.parametrize("sign", [1.0, -1.0])

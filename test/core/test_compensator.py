@@ -13,8 +13,9 @@ import pytest
 
 from exo_gravity.core import gravity_torque
 from exo_gravity.core.arm.interface import NO_LOAD, Payload
+from exo_gravity.core.arm.springs import Springs
 from exo_gravity.core.arm.tilt import Tilt
-from exo_gravity.core.arm.wearer import Wearer
+from exo_gravity.core.arm.wearer import TISSUE_REACH, Wearer
 from exo_gravity.core.compensation.guidance import CommandFade, GuidedChange
 from exo_gravity.core.compensation.support import NAME, REQUEST
 from exo_gravity.core.compensation.terms.catalogue import Spring
@@ -27,20 +28,13 @@ from ..support import ROBOT
 from ..support.compensator_run import PERIOD, THETA, CompensatorRun, settings_with
 
 
-def test_without_a_fresh_tilt_by_arrival_and_by_stamp_there_is_a_reason_instead_of_a_torque():
+def test_without_a_fresh_tilt_there_is_a_reason_instead_of_a_torque():
     run = CompensatorRun(use_imu=True)
     assert run.cycle()[:2] == (None, "no trunk tilt yet")
     run.compensator.tilt.set_tilt(run.now, 0.0, 0.0, age=-TILT.lead)
     assert run.cycle(0.078).held == ""
     assert run.cycle(0.004).held.startswith("trunk tilt older than 80 ms: held on")
     assert run.cycle(0.02).reason == "trunk tilt older than 80 ms"
-    run = CompensatorRun(use_imu=True)
-    for age, count in ((0.07, 100), (0.09, 20)):
-        for _ in range(count):
-            run.compensator.tilt.set_tilt(run.now, 0.1, 0.0, age)
-            answer = run.cycle()
-            assert age > 0.08 or answer.effort is not None
-    assert answer.reason == "trunk tilt older than 80 ms by its stamp: the IMU driver lags, or its clock differs"
     run = CompensatorRun(use_imu=True)
     run.compensator.tilt.set_tilt(run.now, 0.0, 0.0)
     with pytest.raises(ParameterError):
@@ -88,11 +82,18 @@ def test_after_a_break_nothing_is_left_of_a_change():
     assert answer.effort == pytest.approx(gravity_torque(ROBOT, THETA)) and answer.remainder == ()
 
 
+MEASURED_WEARER = {
+    "mode": "zero_g",
+    "wearer_moments": ((0.18, 0.468, 0.8, 0.272), (0.0, -0.044, 0.04, 0.048)),
+    "tissue": Springs((1.5, 1.0, 0.5, 0.8), (0.1, 0.4, 0.3, 0.9), TISSUE_REACH),
+}
 SPRING = TermSettings(spring=Spring((2.0, 4.0, 2.0, 1.0), pose=(0.5, 0.3, 0.3, 0.4), max_effort=(1.0,) * 4))
 
 
 @pytest.mark.parametrize(
-    "change", [{"mode": "zero_g"}, {"max_effort": (0.5,) * 4}, {"terms": SPRING}], ids=["mode", "limits", "a spring"]
+    "change",
+    [{"mode": "zero_g"}, {"max_effort": (0.5,) * 4}, {"terms": SPRING}, MEASURED_WEARER],
+    ids=["mode", "limits", "a spring", "another wearer"],
 )
 def test_a_change_reaches_the_arm_without_a_step_and_is_taken_back_as_gently(change):
     run = CompensatorRun()
@@ -277,15 +278,15 @@ def raised() -> Arm:
     return arm
 
 
-def test_what_is_asked_for_is_carried_by_a_guided_change_and_given_back_two_seconds_after_the_last_request() -> None:
+def test_what_is_asked_for_is_carried_by_a_guided_change_until_2_s_after_the_last_good_request() -> None:
     arm = raised()
     mass = ROBOT.total_mass + 0.7 * sum(SETTINGS.wearer_mass)
     assert arm.compensator.settings.arm.total_mass == pytest.approx(mass)
     share = ROBOT.with_wearer(SETTINGS.wearer_mass, SETTINGS.wearer_cog, 0.7)
     assert arm.answer.effort == pytest.approx(gravity_torque(share, ASKED_AT))
-    arm.asked = None
+    arm.asked = math.nan  # which counts as little as silence
     assert arm.run(REQUEST.expires - 0.3) == 0.7
-    assert arm.run(0.4) == 0.4 and arm.answer.remainder and arm.report == "none"
+    assert arm.run(0.4) == 0.4 and arm.answer.remainder
     arm.run(4.0)
     assert not arm.answer.remainder and arm.largest_step < 0.5
 
@@ -323,12 +324,6 @@ def test_a_request_counts_within_the_set_support_and_one_and_a_wrong_one_moves_n
     vars(arm).update(given)
     assert arm.run(4.0) == carried
     assert not refused or arm.report == f"refused: support_request {refused}"
-
-
-def test_a_wrong_request_lets_the_last_good_one_expire() -> None:
-    arm = raised()
-    arm.asked = math.nan
-    assert arm.run(1.5) == 0.7 and arm.run(1.0) == 0.4
 
 
 def test_a_second_sender_ends_the_support_at_once_until_it_has_been_gone_for_a_while() -> None:

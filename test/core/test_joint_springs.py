@@ -1,9 +1,8 @@
 # Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
-"""Springs at the joints, and joints that are springs: law and MuJoCo's arm agree."""
+"""Springs at the joints, of the robot and of its wearer, and joints that are springs: law and MuJoCo's arm agree."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import replace
 
 import mujoco
@@ -14,7 +13,9 @@ from scipy.optimize import root
 from exo_gravity.core.arm.interface import STANDARD_GRAVITY
 from exo_gravity.core.arm.springs import Springs
 from exo_gravity.core.arm.tilt import Tilt
-from exo_gravity.core.compensation.settings import Settings, compensator_table, settings_of
+from exo_gravity.core.arm.wearer import TISSUE_REACH, Wearer
+from exo_gravity.core.compensation.settings import COMPENSATOR, Settings, compensator_table, settings_of
+from exo_gravity.core.numbers import NO_TORQUE
 from exo_gravity.core.params import values_of
 from exo_gravity.hardware.urdf_arm import UrdfArm
 from exo_gravity.lab.observer.momentum import MomentumObserver
@@ -29,33 +30,14 @@ STIFFNESS, REST = (0.1, 0.15, 0.2, 0.25), (0.1, -0.3, 0.8, 0.5)
 SPRING = Springs(STIFFNESS, REST)
 
 
-def assert_held(settings: Settings, arm: SimulatedArm, tilt: Tilt, gravity: Sequence[float], poses: np.ndarray) -> None:
-    """Law and springs hold MuJoCo's arm at each of `poses` (n, joints) rad; gravity: (3,) m/s^2 in its base."""
-    arm.move_base(gravity)
-    for theta in poses:
+def test_law_and_springs_hold_mujocos_arm_with_springs() -> None:
+    arm, tilt = SimulatedArm(ArmConfig(spring_stiffness=STIFFNESS, spring_rest=REST)), Tilt.of("left", 0.2, -0.1)
+    settings = Settings("left", DEFAULT_LINKS, joint_spring=SPRING)
+    arm.move_base(np.multiply(STANDARD_GRAVITY, tilt.direction).tolist())
+    for theta in np.random.default_rng(1).uniform(-2.0, 2.0, (20, 4)):
         arm.reset(theta)
         torque, _ = settings.torque(theta.tolist(), tilt)
         np.testing.assert_allclose(torque, arm.data.qfrc_bias - arm.data.qfrc_passive, atol=1e-9)
-
-
-def test_law_and_springs_hold_mujocos_arm_with_springs() -> None:
-    arm, tilt = SimulatedArm(ArmConfig(spring_stiffness=STIFFNESS, spring_rest=REST)), Tilt.of("left", 0.2, -0.1)
-    poses = np.random.default_rng(1).uniform(-2.0, 2.0, (20, 4))
-    gravity = np.multiply(STANDARD_GRAVITY, tilt.direction).tolist()
-    assert_held(Settings("left", DEFAULT_LINKS, joint_spring=SPRING), arm, tilt, gravity, poses)
-
-
-@pytest.mark.parametrize("count", [2, 6])
-def test_law_and_springs_hold_mujocos_arm_of_any_number_of_joints(count: int) -> None:
-    rng = np.random.default_rng(count)
-    stiffness, rest = rng.uniform(0.05, 0.3, count).tolist(), rng.uniform(-1.0, 1.0, count).tolist()
-    text, names = random_chain(count, count)
-    given = {"law": "urdf", "joint_names": names, "use_imu": False, "max_effort": [50.0] * count,
-             "joint_spring.stiffness": stiffness, "joint_spring.rest": rest}  # fmt: skip
-    settings = settings_of(values_of(compensator_table(given), given), UrdfArm(text, names, "hand"))
-    arm = SimulatedArm(UrdfConfig(text=text, joint_names=names, spring_stiffness=stiffness, spring_rest=rest))
-    upright, poses = Tilt.of_gravity("left", (0.0, 0.0, -1.0)), rng.uniform(-2.0, 2.0, (10, count))
-    assert_held(settings, arm, upright, (0.0, 0.0, -STANDARD_GRAVITY), poses)
 
 
 @pytest.mark.parametrize("law", ["exact", "paper_static", "paper_mobile"])
@@ -146,8 +128,56 @@ def test_the_law_holds_an_elastic_arm_from_a_urdf(count: int) -> None:
     assert after < 0.05 * before
 
 
-@pytest.mark.parametrize("rigid", [(), (0.0,) * 4])
-def test_without_a_stiffness_the_law_is_that_of_a_rigid_arm(rigid: Sequence[float]) -> None:
-    settings = Settings("left", DEFAULT_LINKS, **({"joint_stiffness": rigid} if rigid else {}))
-    theta, tilt = (0.3, 0.8, 0.7, 0.6), Tilt.of("left", 0.2, -0.1)
-    assert settings.torque(theta, tilt)[0] == DEFAULT_LINKS.torque(theta, tilt)
+# A wearer's arm that is known by its moments and the springs of its joints.
+
+PERSON = ArmConfig(
+    wearer_mass=(0.0, 0.0, 2.0, 1.6), wearer_cog=(0.0, 0.0, 0.16, 0.17), wearer_cog_y=(0.0, 0.0, 0.02, 0.03),
+    wearer_cog_z=(0.0, 0.0, 0.01, -0.04), wearer_stiffness=(1.5, 1.0, 0.5, 0.8), wearer_rest=(0.1, 0.4, 0.3, 0.9),
+)  # fmt: skip
+ALONG = (3.6 * 0.05, 3.6 * 0.13, 2.0 * 0.16 + 1.6 * 0.3, 1.6 * 0.17)
+ACROSS = (0.0, 2.0 * 0.01 - 1.6 * 0.04, 2.0 * 0.02, 1.6 * 0.03)
+TISSUE = Springs(PERSON.wearer_stiffness, PERSON.wearer_rest, TISSUE_REACH)
+SETTINGS = Settings(
+    "left", DEFAULT_LINKS, mode="zero_g", support=1.0, wearer_mass=PERSON.wearer_mass, wearer_cog=PERSON.wearer_cog,
+    wearer_moments=(ALONG, ACROSS), tissue=TISSUE, max_effort=(30.0,) * 4,
+)  # fmt: skip
+POSES = np.random.default_rng(3).uniform((-0.5, 0.0, -0.5, 0.0), (0.9, 1.3, 1.2, 1.5), (20, 4)).tolist()
+
+
+def held(config, pose):
+    """Return the torque (n,) in Nm that holds a simulated arm on an upright trunk."""
+    arm = SimulatedArm(config)
+    arm.reset(pose)
+    return arm.data.qfrc_bias - arm.data.qfrc_passive
+
+
+def test_zero_g_holds_segments_beside_their_links_and_springs_and_the_observer_sees_no_wearer():
+    tilt, bare = Tilt.of("left"), replace(PERSON, wearer_mass=NO_TORQUE, wearer_stiffness=NO_TORQUE)
+    for pose in POSES:
+        needed, own = held(PERSON, pose), held(bare, pose)
+        assert SETTINGS.torque(pose, tilt)[0] == pytest.approx(needed, abs=1e-9)
+        part = replace(SETTINGS, support=0.4).torque(pose, tilt)[0]
+        assert part == pytest.approx(own + 0.4 * (needed - own), abs=1e-9)
+        assert replace(SETTINGS, mode="one_g").torque(pose, tilt)[0] == pytest.approx(own, abs=1e-9)
+        estimate = MomentumObserver(SETTINGS).update(0.0, (pose, NO_TORQUE, needed.tolist()), tilt)
+        assert estimate.torque == pytest.approx(NO_TORQUE, abs=1e-9)
+        weight = needed - own - TISSUE.torque(pose)
+        assert estimate.weight == pytest.approx(weight, abs=1e-9)  # gravity's alone
+
+
+def test_beyond_its_reach_a_spring_pulls_no_harder():
+    tissue = Springs((1.0, 0.0, 2.0), (0.1, 0.0, -0.2), TISSUE_REACH)
+    assert tissue.torque((0.6, 3.0, -0.7)) == pytest.approx((0.5, 0.0, -1.0))
+    assert tissue.torque((3.0, 3.0, -3.0)) == pytest.approx((TISSUE_REACH, 0.0, -2.0 * TISSUE_REACH))
+
+
+GIVEN = {"wearer.first_moment": list(ALONG), "wearer.off_axis": list(ACROSS)}
+VALUES = values_of(COMPENSATOR, {"mode": "zero_g", "support": 1.0, **GIVEN})
+
+
+def test_moments_stand_in_place_of_masses():
+    alone, tabled = settings_of(VALUES), settings_of({**VALUES, "wearer.body_mass": 75.0})
+    assert alone.arm.first_moment == pytest.approx(np.add(alone.robot.first_moment, ALONG))
+    assert sum(alone.wearer_mass) == pytest.approx(3.6, rel=0.3)  # for the inertia
+    mass, _ = Wearer(75.0).on_links(tabled.robot.length)
+    assert tabled.arm == alone.arm and tuple(tabled.wearer_mass) == tuple(mass)

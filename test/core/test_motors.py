@@ -1,7 +1,7 @@
 # Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
-"""Frames of the motors: every code survives, the scaling is the manual's, no frame has two meanings.
+"""Frames of the motors: every code survives, the scaling is the manual's, no frame has two meanings; the bus load.
 
-Any bytes or numbers give a value within the wire range or a clear error. Bytes are worked out by hand from the
+Bytes are worked out by hand from the
 documents that core/motors names, or come from public drivers.
 """
 
@@ -12,10 +12,11 @@ import math
 import pickle
 import re
 import struct
+from collections.abc import Iterator
 from dataclasses import replace
-from functools import partial
 from pathlib import Path
 
+import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -34,6 +35,7 @@ from exo_gravity.core.motors.frames import (
     ENTER,
     EXIT,
     EXTENDED,
+    ID_BITS,
     MALFORMED,
     OTHER,
     REPLY,
@@ -41,48 +43,53 @@ from exo_gravity.core.motors.frames import (
     SET_ZERO,
     SETTING,
     MotorReply,
+    MotorSpec,
+    WireFormat,
     is_special,
     pack_command,
     unpack_command,
 )
-from exo_gravity.core.motors.joint_motor import MAX_CAN_ID, JointMotor, JointSample, motors_of
+from exo_gravity.core.motors.joint_motor import (
+    BITRATE,
+    COMMAND_BITS,
+    FD_BITS,
+    FD_COMMAND_BITS,
+    FD_REPLY_BITS,
+    MAX_CAN_ID,
+    REPLY_BITS,
+    STATUS_BITS,
+    V3_COMMAND_BITS,
+    JointMotor,
+    JointSample,
+    Traffic,
+    motors_of,
+    traffic_of,
+)
 from exo_gravity.core.params import values_of
 from exo_gravity.core.safety.limits import CAN_BRIDGE, limits_of
 
 AK60 = MOTORS["AK60-6"]
 V3_AK60, V3_AK80 = MIT_V3.ranged(AK60), MIT_V3.ranged(MOTORS["AK80-9"])
-SPECS = pytest.mark.parametrize("spec", AK.values(), ids=AK)
 OF_COMMAND, OF_REPLY = ("position", "velocity", "kp", "kd", "torque"), ("position", "velocity", "torque")
 # Seven bytes FF and one of EE to FF are special on some firmware: codes by which the torque is then reduced at most.
 SPECIAL_FRAMES = [b"\xff" * 7 + bytes((last,)) for last in range(0xEE, 0x100)]
 SPECIAL_NUDGE = len(SPECIAL_FRAMES)
-LONGEST = 80  # bytes; CAN FD has up to 64
 IDS = frozenset((1, 2, 3, 126))
 
 seeded = settings(max_examples=60, derandomize=True, database=None, deadline=None)
 NUMBERS = st.floats() | st.floats(-20.0, 20.0) | st.floats(0.0, 600.0) | st.integers(-(10**30), 10**30)
+BOARDS = st.sampled_from([*((MIT, spec) for spec in AK.values()), (MIT_V3, V3_AK60), (MIT_V3, V3_AK80)])
 SHARES = st.floats(-1.0, 1.0) | st.sampled_from((-1.0, 0.0, 1.0))
 
 
-@st.composite
-def specs(draw):
-    """A motor with its default ranges or with those of another firmware."""
-    spec = draw(st.sampled_from(list(AK.values())))
-    ranges = {"velocity_range": st.floats(1.0, 100.0), "torque_range": st.floats(1.0, 100.0)}
-    return draw(st.just(spec) | st.builds(partial(replace, spec), **ranges))
+def mounted(board, *mounting):
+    """A joint whose motor has this format and these ranges."""
+    return JointMotor(board[1], *mounting, board[0])
 
 
-@st.composite
-def boards(draw):
-    """A format, and a motor with its ranges."""
-    return draw(st.tuples(st.just(MIT), specs()) | st.tuples(st.just(MIT_V3), st.sampled_from((V3_AK60, V3_AK80))))
-
-
-@st.composite
-def joints(draw):
-    board, spec = draw(boards())
-    mounting = draw(st.integers(1, 126)), draw(st.sampled_from((1, -1))), draw(st.floats(-9.0, 9.0))
-    return JointMotor(spec, *mounting, draw(st.floats(0.2, 2.0)), board)
+MOUNTED = st.builds(
+    mounted, BOARDS, st.integers(1, 126), st.sampled_from((1, -1)), st.floats(-9.0, 9.0), st.floats(0.2, 2.0)
+)
 
 
 def bounds(spec, field):
@@ -107,20 +114,7 @@ def scaled(spec, fields, shares):
 
 
 @seeded
-@given(boards(), st.tuples(*[NUMBERS] * 5))
-def test_any_numbers_give_a_command_of_8_bytes_or_an_error_that_names_the_field(board, values):
-    wire_format, spec = board
-    inside = [bounds(spec, f)[0] <= v <= bounds(spec, f)[1] for f, v in zip(OF_COMMAND, values, strict=True)]
-    if all(inside):
-        assert len(wire_format.pack_command(spec, *values)) == 8
-        return
-    with pytest.raises(ParameterError) as caught:
-        wire_format.pack_command(spec, *values)
-    assert not inside[OF_COMMAND.index(caught.value.name)]
-
-
-@seeded
-@given(boards(), st.tuples(*[SHARES] * 5), st.integers(1, MAX_CAN_ID))
+@given(BOARDS, st.tuples(*[SHARES] * 5), st.integers(1, MAX_CAN_ID))
 def test_a_command_survives_a_round_trip_within_half_a_code_and_is_a_command(board, shares, can_id):
     wire_format, spec = board
     sent = scaled(spec, OF_COMMAND, shares)
@@ -136,7 +130,7 @@ def test_a_command_survives_a_round_trip_within_half_a_code_and_is_a_command(boa
 
 
 @seeded
-@given(joints(), st.tuples(*[SHARES] * 3), st.integers(-40, 127), st.integers(0, 255), st.floats(-3.0, 3.0))
+@given(MOUNTED, st.tuples(*[SHARES] * 3), st.integers(-40, 127), st.integers(0, 255), st.floats(-3.0, 3.0))
 def test_a_reply_survives_a_round_trip_and_is_a_reply(motor, shares, temperature, error, angle):
     wire_format, spec, can_id = motor.wire_format, motor.spec, motor.can_id
     sent = MotorReply(can_id, *scaled(spec, OF_REPLY, shares), temperature, error)
@@ -151,7 +145,7 @@ def test_a_reply_survives_a_round_trip_and_is_a_reply(motor, shares, temperature
 
 
 @seeded
-@given(joints(), NUMBERS, NUMBERS)
+@given(MOUNTED, NUMBERS, NUMBERS)
 def test_a_joint_at_rest_gets_any_effort_without_stiffness_within_its_range_or_rejects_it(motor, effort, damping):
     spec = motor.spec
     try:
@@ -234,11 +228,6 @@ def test_an_error_is_named_as_in_the_manuals(board, byte, text):
     assert board.error_text(byte).startswith(text)
 
 
-def test_a_v3_board_is_switched_off_by_a_current_of_0():
-    motor = JointMotor(V3_AK60, 5, wire_format=MIT_V3)
-    assert (motor.exit, motor.enter, motor.set_zero) == (((EXTENDED | 0x105, bytes(4)),), (), ())
-
-
 def test_a_motor_keeps_its_wire_format_on_the_way_to_the_watchdog():
     for board in FORMATS.values():
         motor = JointMotor(board.ranged(MOTORS["AK80-9"]), 4, wire_format=board)
@@ -312,6 +301,8 @@ def test_commands_and_replies_have_the_bytes_worked_out_by_hand():
         assert wire_format.unpack_reply(spec, can_id, bytes.fromhex(data)) == pytest.approx((can_id, *values))
     assert JointMotor(V3_AK60, 0x7E, wire_format=MIT_V3).command_id == EXTENDED | 0x87E
     assert MIT_V3.reply_id(3) == EXTENDED | 0x2903
+    motor = JointMotor(V3_AK60, 5, wire_format=MIT_V3)  # a current of 0 switches it off
+    assert (motor.exit, motor.enter, motor.set_zero) == (((EXTENDED | 0x105, bytes(4)),), (), ())
 
 
 @pytest.mark.parametrize(("state", "on", "error"), [(0, False, 0), (1, True, 0), (0xD, False, 0), (0xE, False, 0xE)])
@@ -505,3 +496,148 @@ def test_a_motor_that_is_switched_on_must_read_room_temperature(temperatures, od
     assert boards.odd_temperature.startswith(odd) and bool(boards.odd_temperature) is bool(odd)
     boards.take(0, sample(9.0, -15))  # it was switched off and on
     assert "motor 1 read -15 degC" in boards.odd_temperature
+
+
+# The bits of CAN frames and the bus load, against the CAN specification and hand-computed figures.
+
+AK60 = MOTORS["AK60-6"]
+V3, FD = MIT_V3.ranged(AK60), MOTORS["DM-J4340"]
+FOUR_AK = {"motor": ["AK60-6"] * 4}
+
+
+def frame_bits(data_bytes: int, is_extended: bool = False) -> tuple[int, int]:
+    """The bits of a frame by the specification: without stuff bits, and with as many as possible."""
+    stuffed = 34 + 20 * is_extended + 8 * data_bytes
+    return stuffed + 13, stuffed + 13 + (stuffed - 1) // 4
+
+
+def stuffed(bits: list[int]) -> list[int]:
+    """The places of the bits that a stuff bit follows: after 5 equal ones; it starts the next run."""
+    places, last, run = [], None, 0
+    for place, bit in enumerate(bits):
+        run = run + 1 if bit == last else 1
+        last = bit
+        if run == 5:
+            places.append(place)
+            last, run = 1 - bit, 1
+    return places
+
+
+def stuffed_bits(can_id: int, data: bytes, is_extended: bool = False) -> int:
+    """The exact number of bits of one frame, with its stuff bits."""
+    head = [*bits_of(can_id >> 18, 11), 1, 1, *bits_of(can_id & 0x3FFFF, 18)] if is_extended else bits_of(can_id, 11)
+    bits = [0, *head, 0, 0, 0, *bits_of(len(data), 4), *(bit for byte in data for bit in bits_of(byte, 8))]
+    bits += bits_of(crc(bits), 15)
+    return frame_bits(len(data), is_extended)[0] + len(stuffed(bits))
+
+
+def bits_of(value: int, width: int) -> list[int]:
+    return [value >> place & 1 for place in reversed(range(width))]
+
+
+def crc(bits: list[int]) -> int:
+    """Return CAN's CRC-15: polynomial 0x4599, initial value 0."""
+    register = 0
+    for bit in bits:
+        turn = bit ^ register >> 14
+        register = (register << 1 & 0x7FFF) ^ (0x4599 if turn else 0)
+    return register
+
+
+def frames(board: WireFormat, spec: MotorSpec, is_reply: bool, count: int = 4) -> Iterator[tuple[int, bytes, bool]]:
+    """ID, data and kind of ID of the frames of an arm of `count` motors, in random poses at random torques."""
+    rng = np.random.default_rng(5)
+    for index in range(2000):
+        can_id = index % count + 1
+        torque, position, velocity = (rng.uniform((-3, -1.65, -1), (3, 3.14, 1)) * (count / 4, 1, 1)).tolist()
+        reply = MotorReply(can_id, position, velocity, torque, int(rng.integers(20, 60)), 0)
+        frame_id = (board.reply_id(can_id) or can_id) if is_reply else board.first_id + can_id
+        command = board.pack_command(spec, 0.0, 0.0, 0.0, 0.0, torque)
+        yield frame_id & ID_BITS, board.pack_reply(spec, reply, True) if is_reply else command, board is MIT_V3
+
+
+def test_the_counter_of_this_test_agrees_with_a_hand_count_and_the_check_value_of_crc_15_can():
+    # 34 zeros (start, ID, control, length 0, a CRC of 0): a stuff bit after the first 5, then after every 5 more.
+    assert stuffed_bits(0, b"") == frame_bits(0)[0] + 34 // 5
+    assert crc([bit for byte in b"123456789" for bit in bits_of(byte, 8)]) == 0x059E
+
+
+CLASSIC = [
+    (MIT, AK60, False, COMMAND_BITS),
+    (MIT, AK60, True, REPLY_BITS),
+    (MIT_V3, V3, False, V3_COMMAND_BITS),
+    (MIT_V3, V3, True, STATUS_BITS),
+]
+
+
+@pytest.mark.parametrize(("board", "spec", "is_reply", "bits"), CLASSIC)
+def test_typical_bits_are_the_mean_of_a_carried_arm_and_the_most_those_of_the_specification(
+    board, spec, is_reply, bits
+):
+    assert np.mean([stuffed_bits(*frame) for frame in frames(board, spec, is_reply)]) == pytest.approx(
+        bits.typical, abs=1.0
+    )
+    assert bits.most == frame_bits(8, board is MIT_V3)[1]
+
+
+def fd_bits(can_id: int, data: bytes) -> tuple[int, int]:
+    """The bits of a CAN FD frame at the bit rates of arbitration and of data, with its stuff bits before the CRC.
+
+    After the data: stuff count 4, CRC 17, 6 fixed stuff bits; then, slowly again, 13 bits to the next frame.
+    """
+    head = [0, *bits_of(can_id, 11), 0, 0, 1, 0, 1]
+    rest = [0, *bits_of(len(data), 4), *(bit for byte in data for bit in bits_of(byte, 8))]
+    places = stuffed([*head, *rest])
+    slow = sum(place < len(head) for place in places)
+    return len(head) + 13 + slow, len(rest) + 27 + len(places) - slow
+
+
+@pytest.mark.parametrize(("is_reply", "fast"), [(False, FD_COMMAND_BITS), (True, FD_REPLY_BITS)])
+def test_typical_bits_of_can_fd_are_the_mean_of_a_carried_arm(is_reply, fast):
+    bits = [fd_bits(can_id, data) for can_id, data, _ in frames(DAMIAO_MIT, FD, is_reply, 8)]
+    assert np.mean(bits, axis=0) == pytest.approx((FD_BITS.typical, fast.typical), abs=1.0)
+    assert np.all(np.max(bits, axis=0) <= (FD_BITS.most, fast.most))
+
+
+REPORTED = 4 * (500.0 * STATUS_BITS.typical + 250.0 * V3_COMMAND_BITS.typical) / BITRATE
+LOADS = [  # motors, Hz, whether with the most stuffing, and the load
+    (Traffic(4), 500.0, False, 0.48),
+    (Traffic(4), 500.0, True, 0.54),
+    (Traffic(4), 926.0, True, 1.0),
+    (Traffic(4), Traffic(4).largest_rate, False, 1.0),
+    (Traffic(0, 4), 250.0, False, REPORTED),
+    (Traffic(8), 500.0, False, 0.97),
+    (Traffic(8, data_bitrate=5_000_000), 1000.0, False, 0.84),
+]
+
+
+@pytest.mark.parametrize(("motors", "rate", "worst", "load"), LOADS)
+def test_the_load_of_replying_and_reporting_motors(motors, rate, worst, load):
+    assert motors.load(rate, worst) == pytest.approx(load, abs=0.01)
+
+
+def test_a_rate_that_crowds_the_bus_is_known_and_a_slow_bus_gets_fewer_reports():
+    Traffic(4).check(1000.0)
+    Traffic(0, 4, bitrate=250_000).check(160.0)
+    slow = Traffic(4, bitrate=250_000)
+    assert slow.is_crowded(240.0) and not slow.is_crowded(206.0) and slow.is_crowded(207.0)
+
+
+SLCAN = {"can.interface": "slcan", "wire_format": ["mit", "mit", "mit_v3", "mit_v3"], **FOUR_AK}
+SOCKETCAN = {"can.interface": "socketcan", "wire_format": ["mit"] * 4, **FOUR_AK}
+ON_FD = {**SOCKETCAN, "can.channel": "c", "motor": ["DM-J8009", "DM-J8009", "DM-J4340", "DM-J4310"]}
+BUSES = [  # parameters, options, and the traffic of each bus
+    ({**SOCKETCAN, "can.channel": "can0,can0,can1,can1"}, {}, {"can0": Traffic(2), "can1": Traffic(2)}),
+    ({**SLCAN, "can.channel": "c"}, {"bitrate": 250_000}, {"c": Traffic(2, 2, 250_000)}),
+    (
+        {**SLCAN, "can.channel": "a, b,b, b"}, {"bitrate": [250_000, 1_000_000, 1_000_000, 1_000_000]},
+        {"a": Traffic(1, 0, 250_000), "b": Traffic(1, 2, 1_000_000)},
+    ),
+    (ON_FD, {"fd": True}, {"c": Traffic(4, data_bitrate=5_000_000)}),
+    (ON_FD, {"fd": True, "data_bitrate": 2_000_000}, {"c": Traffic(4, data_bitrate=2_000_000)}),
+]  # fmt: skip
+
+
+@pytest.mark.parametrize(("values", "options", "traffic"), BUSES)
+def test_each_bus_has_the_load_of_its_own_motors(values, options, traffic):
+    assert traffic_of(values, options) == traffic

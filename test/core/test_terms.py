@@ -477,28 +477,3 @@ def test_a_lower_bound_holds_for_the_efforts_that_are_followed_already_and_with_
     assert loop.run(0.04) == torque  # the newest message is still valid
     loop.sending = True
     assert loop.run(1.0) == torque and loop.input.state == state
-
-
-number = st.one_of(st.floats(-50.0, 50.0), st.sampled_from([math.nan, math.inf]))
-message = st.fixed_dictionaries(
-    {},
-    optional={
-        "efforts": st.lists(number, min_size=3, max_size=5).map(tuple),
-        "names": st.permutations(NAMES),
-        "publisher": st.sampled_from([1, 1, 1, 2]),
-        "lag": st.floats(-0.1, 0.3),
-    },
-)
-
-
-@settings(max_examples=80, deadline=None)
-@given(st.lists(st.tuples(message, st.sampled_from([0.002, 0.01, 0.05, 0.1, 0.3])), max_size=40))
-def test_no_sequence_of_messages_exceeds_the_bound(sequence):
-    loop = OuterLoop()
-    loop.sending = False
-    for changes, pause in sequence:
-        lag = changes.pop("lag", 0.0)
-        loop.send(**changes, stamp=loop.now - lag)
-        loop.run(pause)
-    torques = np.array(loop.torques).reshape(-1, 4)
-    assert np.all(np.abs(torques) <= ASSIST.max_effort)

@@ -268,16 +268,12 @@ def test_a_restart_keeps_the_bias():
     assert orientation.bias[0] == pytest.approx(0.02, abs=2e-3)
 
 
-def following(force, spin, until=1.0, period=0.01):
+def following(force, spin=lambda time: STILL, until=1.0, period=0.01):
     """A follower of the vectors force(t) and spin(t), sampled until `until`."""
     felt = FeltMotion()
     for t in np.arange(0.0, until + period / 2, period):
         felt.add(t, force(t), spin(t))
     return felt
-
-
-def still(_time):
-    return STILL
 
 
 def shaken(t, frequency=1.9):
@@ -290,21 +286,21 @@ def shaken(t, frequency=1.9):
     [(1.9, 100.0, 0.06), (3.8, 100.0, 0.3), *((1.9, rate, 0.1) for rate in (40.0, 50.0, 250.0, 1000.0))],
 )
 def test_a_shake_is_felt_as_it_will_be_when_the_motors_answer(age, frequency, rate, most):
-    felt = following(lambda t: shaken(t, frequency), still, period=1.0 / rate).at(1.0 + age)
+    felt = following(lambda t: shaken(t, frequency), period=1.0 / rate).at(1.0 + age)
     assert felt.gravity[2] == pytest.approx(-shaken(1.0 + age + FELT.effect, frequency)[2], abs=most)
 
 
 def test_too_few_or_too_old_samples_and_a_gap_give_no_motion_and_blows_count_within_a_range():
     assert FeltMotion().at(0.0) is None
-    assert following(shaken, still, until=0.02).at(0.02) is None
-    felt = following(shaken, still)
+    assert following(shaken, until=0.02).at(0.02) is None
+    felt = following(shaken)
     felt.add(0.5, (5.0, 5.0, 5.0), STILL)  # a sample that is late is ignored
     assert felt.at(1.004).gravity[:2] == pytest.approx((0.0, 0.0), abs=1e-9)
     assert felt.at(1.1) is None
     felt.add(1.3, shaken(1.3), STILL)
     assert felt.at(1.3) is None
     for force, most in zip((0.1, 8.0 * G), FELT.range, strict=True):
-        gravity = following(lambda t, force=force: (0.0, 0.0, force), still).at(1.0).gravity
+        gravity = following(lambda t, force=force: (0.0, 0.0, force)).at(1.0).gravity
         assert np.linalg.norm(gravity) == pytest.approx(most)
 
 

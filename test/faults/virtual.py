@@ -101,8 +101,9 @@ class StruckArm(Rig):
         if stage in ("active", "letting down"):
             self.take_home()  # on a tilted trunk a light or worn arm swings, or hangs beyond its limits
             self.carry()
-            self.act({"move": list(self.arm.pose), "over": 1.0}, {"hold": HOLD})
-            self.run(1.0 + STEADY)
+            over = max(1.0, max(map(abs, self.arm.pose)) / 2.0)  # s: slower than is a fault
+            self.act({"move": list(self.arm.pose), "over": over}, {"hold": HOLD})
+            self.run(over + STEADY)
             assert self.state is State.ACTIVE, self.fault
         else:
             self.between_cycles(self.safety.enable)

@@ -146,6 +146,11 @@ def with_friction(coulomb: float, **other: Any) -> Arm:
     )
 
 
+BENT = replace(with_friction(0.01, viscous=[0.0] * 4), pose=(1.5, 1.5, -0.7, 2.4))
+BENT = replace(BENT, simulator={**BENT.simulator, "trunk.pitch": 0.4, "trunk.roll": -0.3})
+WEAK_MOTORS = Arm(can_bridge={"torque_scale": [0.6] * 4, "max_effort": [3.0, 9.0, 3.0, 3.0]})
+
+
 def not_thrown_back(records: np.ndarray) -> str:
     """Return what is wrong if the elbow leaves the wall faster than a fifth of its speed into the wall.
 
@@ -213,11 +218,6 @@ def outer_loop_case(name: str, inject: Action, reason: str, **options: Any) -> F
 
     given = {"check": only_the_assistance_ends, "afterwards": reports, **options}
     return FaultCase(name, inject, ASSISTED, limit=None, outcomes=("active",), **given)
-
-
-def refused_again(rig: StruckArm) -> None:
-    """Check that clear and enable do not switch on a motor that still reports its error."""
-    enabled_in_vain(rig, pause(4.0))
 
 
 def expired(rig: StruckArm) -> None:
@@ -321,11 +321,6 @@ def second(change: Callable[[float, float], float]) -> Action:
     return change_efforts(lambda now, effort: (effort[0], change(now, effort[1]), *effort[2:]))
 
 
-def set_zero(rig: StruckArm) -> None:
-    """Send SET_ZERO to the struck motor, as another host would."""
-    rig.send((rig.motors[rig.struck].joint.command_id, SET_ZERO))
-
-
 def stop_imu_for_a_moment(rig: StruckArm) -> None:
     """Stop the process that reads the IMU for 0.1 s, after which it sends the newest of what came meanwhile."""
     rig.imu_silent = True
@@ -352,11 +347,6 @@ def unknown_states(rig: StruckArm) -> None:
     rig.direct.take = lambda now, samples: take(  # type: ignore[method-assign]
         now, [sample._replace(position=math.nan) for sample in samples]
     )
-
-
-def unknown_tilt(rig: StruckArm) -> None:
-    """Let the IMU read NaN."""
-    rig.imu_frozen = TrunkReading((math.nan,) * 3)
 
 
 def set_impossible_parameters(rig: StruckArm) -> None:
@@ -459,7 +449,9 @@ MOTORS = (
         afterwards=refused_on_the_wrong_angle, outcomes=("position_jump", "over_speed")),
     FaultCase("foreign EXIT to motor 2, once", exit_frame, PAPER, steps_from=0.05,
         outcomes=("foreign_command", "torque_not_delivered")),
-    FaultCase("foreign SET_ZERO to motor 2, once", set_zero, PAPER, unreached=(1,), steps_from=0.05),
+    FaultCase("foreign SET_ZERO to motor 2, once",
+        lambda rig: rig.send((rig.motors[rig.struck].joint.command_id, SET_ZERO)), PAPER, unreached=(1,),
+        steps_from=0.05),
     FaultCase("foreign 6 Nm to motor 2, 500 a second for 2 s", foreign(FOREIGN), PAPER, steps_from=2.1,
         outcomes=("foreign_command",), energy_limit=2.0),  # the foreign torque does work until opposed
     FaultCase("random frames", in_turn(random_frames((0, *range(5, 2048))), pause(2.0)), PAPER, None,
@@ -467,6 +459,11 @@ MOTORS = (
     FaultCase("imu silent", happens("imu_silent"), PAPER, limit=PROCESS_REACTION),
 )
 DESCENT = (
+    FaultCase("arm disabled, upright overhead", happens("disable"),
+        replace(with_friction(0.01, viscous=[0.0] * 4), pose=(0.0, 2.9, 0.0, 0.0)), outcomes=OFF),
+    FaultCase("arm disabled, bent, on a tilted trunk", happens("disable"), BENT, outcomes=OFF),
+    # The largest damping is then 3 Nm s/rad at the joint: no motor is taken for one that is off.
+    FaultCase("arm disabled, motors of 0.6 of the torque", happens("disable"), WEAK_MOTORS, outcomes=OFF),
     FaultCase("enabled again while let down", happens("enable"), PAPER, stage="letting down", outcomes=OFF),
     FaultCase("motor 2 cut off for 2 s while let down", in_turn(CUT_OFF, pause(2.0), CONNECT), PAPER,
         stage="letting down"),
@@ -500,7 +497,8 @@ EFFORTS = (
         outcomes=("command_stale",)),
     FaultCase("effort NaN", happens("efforts_nan"), COMMANDED),
     FaultCase("NaN joint states", unknown_states, PAPER, outcomes=("command_withdrawn",)),
-    FaultCase("NaN tilt", unknown_tilt, PAPER, limit=PROCESS_REACTION, outcomes=("command_withdrawn",)),
+    FaultCase("NaN tilt", lambda rig: setattr(rig, "imu_frozen", TrunkReading((math.nan,) * 3)), PAPER,
+        limit=PROCESS_REACTION, outcomes=("command_withdrawn",)),
     FaultCase("impossible parameters", set_impossible_parameters, PAPER, limit=None, outcomes=("active",)),
     FaultCase("no efforts", happens("efforts_withdrawn"), COMMANDED),
     FaultCase("efforts 3 times too large", change_efforts(lambda now, effort: [3.0 * each for each in effort]),
@@ -567,8 +565,8 @@ FIRMWARE = (
     FaultCase("all motors mute for 4 s", mute(*ALL_JOINTS), PAPER, speed_limit=CARELESS, driven_limit=CARELESS,
         outcomes=("motor_silent",)),
     FaultCase("motor 2 mute for 4 s", mute(1), PAPER, outcomes=("motor_silent",), driven_limit=0.6),
-    FaultCase("motor 2 reports an encoder error, then clear and enable", ERROR, PAPER, afterwards=refused_again,
-        outcomes=("motor_error",)),
+    FaultCase("motor 2 reports an encoder error, then clear and enable", ERROR, PAPER,
+        afterwards=lambda rig: enabled_in_vain(rig, pause(4.0)), outcomes=("motor_error",)),
 )
 # Further values of what another row shows: thorough.
 FURTHER = (
@@ -592,6 +590,7 @@ FURTHER = (
     FaultCase("V3 boards: foreign 6 Nm to motor 2, 500 a second for 2 s", foreign(FOREIGN), ON_V3, steps_from=2.5,
         outcomes=("foreign_command",), energy_limit=2.0),
     FaultCase("arm disabled, friction 0.5 Nm", happens("disable"), with_friction(0.5), outcomes=OFF),
+    FaultCase("arm disabled, flexed", happens("disable"), replace(PAPER, pose=(0.0, 0.1, 2.3, 0.1)), outcomes=OFF),
     load_case("support 1 to 0, 75 kg", {"support": 0.0}, {"support": 1.0}),
     load_case("a spring of 14 Nm/rad, Zero-G, 75 kg", SPRING, {"spring.stiffness": [0.0] * 4}),
     load_case("body mass 75 to 100", {"wearer.body_mass": 100.0}, {"wearer.body_mass": 75.0}),

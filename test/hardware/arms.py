@@ -8,7 +8,7 @@ import os
 import sys
 import threading
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -18,21 +18,23 @@ import numpy as np
 from exo_gravity.core.arm.wearer import Wearer
 from exo_gravity.core.compensation.compensator import JOINTS
 from exo_gravity.core.compensation.settings import Settings
+from exo_gravity.core.errors import BusError
 from exo_gravity.core.motors.ak import MIT
 from exo_gravity.core.motors.frames import WireFormat
 from exo_gravity.core.motors.joint_motor import JointMotor, channels_of
 from exo_gravity.core.safety.drive import State
 from exo_gravity.core.safety.limits import Limits
 from exo_gravity.hardware.bus_lock import DriveNotes
-from exo_gravity.hardware.can_port import Address, ArmOnBus, open_bus
+from exo_gravity.hardware.can_port import Address, ArmOnBus, CanPort, open_bus
+from exo_gravity.hardware.motor_bus import MotorBus
 from exo_gravity.sim import ArmConfig, SimulatedMotor
 from exo_gravity.sim.arm import DEFAULT_LINKS, SimulatedArm
 from exo_gravity.sim.device import SimulatedDevice
+from exo_gravity.sim.events import ACTS
 from exo_gravity.sim.rig import Rig
 from exo_gravity.sim.truth import TruthRecords
 from exo_gravity.sim.virtual_time import Wire
 
-from ..support.active_wearer import Behaviour, attach
 from ..support.copies import prepared
 from ..support.ports import own_ports
 from ..support.simulated_device import joints_of
@@ -65,11 +67,6 @@ class JudgedArm(Rig):
         super().raise_to(pose, over, settle)
         assert self.state is State.ACTIVE, self.safety.fault
         self.forget()
-
-    def lead(self, hand: Behaviour) -> None:
-        """Let a hand act on the arm from now on."""
-        self.catch_up()
-        attach(self.device, hand)
 
     @property
     def records(self) -> np.ndarray:
@@ -205,6 +202,42 @@ def bare_arm(**options: Any) -> CarriedArm:
 
 
 raised_usual_arm, raised_arm = prepared(usual_arm), prepared(bare_arm)
+
+
+class Responder:
+    """Answers each frame on `wire` with those that `answer` returns, at once. received: all frames."""
+
+    def __init__(self, wire: Wire, answer: Callable[[can.Message], list[can.Message]] = lambda message: []) -> None:
+        self.received: list[can.Message] = []
+        self._wire, self._answer = wire, answer
+        wire.ends.append(self)
+
+    def deliver(self, message: can.Message) -> None:
+        """Receive a frame, and answer it."""
+        self.received.append(message)
+        for reply in self._answer(message):
+            self._wire.carry(self, reply)
+
+
+def motor_bus(wire: Wire, joints: Sequence[JointMotor]) -> MotorBus:
+    """Return the bridge's end of a bus with all these motors."""
+    return MotorBus([CanPort(wire.open(), wire.clock)] * len(joints), joints, clock=wire.clock)
+
+
+def cut(duration: float, *joints: int) -> Callable[[Rig], None]:
+    """Return the event that the motors of `joints`, by default of all, have no power for `duration` s."""
+
+    def act(arm: Rig) -> None:
+        for joint in joints or range(len(arm.motors)):
+            ACTS["unplugged"](arm, joint, duration)
+
+    return act
+
+
+def lose_bus(arm: CarriedArm, name: str = FIRST) -> None:
+    """Let a bus fail, and let nobody open it again."""
+    arm.wires[name].refusal = BusError("no such device")
+    arm.wires[name].break_down(can.CanOperationError("No buffer space available"))
 
 
 class SimulatedRig:

@@ -4,8 +4,6 @@
 It prints the PID of its watchdog once the motors are on and the watchdog runs.
 """
 
-from __future__ import annotations
-
 import os
 import pickle
 import sys

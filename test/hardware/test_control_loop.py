@@ -1,7 +1,7 @@
 # Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
 """The control loop on the simulated arm, in virtual time: whatever raises an exception, the arm is let down.
 
-Also where its motors are on two buses, and where another owner left them on.
+Also where its motors are on two buses, where another owner left them on, and where replies are late.
 """
 
 from __future__ import annotations
@@ -26,13 +26,27 @@ from exo_gravity.hardware.can_port import CanPort, message_of
 from exo_gravity.hardware.clock import COMPUTER_CLOCK
 from exo_gravity.hardware.control_loop import HAND_OVER_TIME, LOWERING, ControlLoop, NoController
 from exo_gravity.hardware.motor_bus import FOREIGN_COMMAND, MotorBus
-from exo_gravity.sim.events import ACTS
+from exo_gravity.hardware.request_age import AGE, Requests
+from exo_gravity.sim.virtual_time import VirtualBus
 
 from ..support.simulated_device import drive_of
 from ..support.thorough import quick
-from .arms import CYCLE, DRIVEN, FIRST, LIMITS, MOTORS_OF_ARM, ON_TWO, SECOND, CarriedArm
+from .arms import (
+    CYCLE,
+    DRIVEN,
+    FIRST,
+    LIMITS,
+    MOTORS_OF_ARM,
+    ON_TWO,
+    REAL_RATE,
+    SECOND,
+    CarriedArm,
+    Responder,
+    cut,
+    lose_bus,
+    raised_usual_arm,
+)
 from .arms import raised_arm as raised
-from .wires import Responder
 
 
 def fail(*_: object) -> None:
@@ -138,23 +152,17 @@ def test_a_failing_state_machine_hands_the_arm_over_to_the_watchdog_and_sends_no
     assert isinstance(arm.loop.failure, ZeroDivisionError)
 
 
-def cut_supply(arm: CarriedArm, duration: float) -> None:
-    """Take the power of all motors away for `duration` s."""
-    for joint in range(len(arm.motors)):
-        ACTS["unplugged"](arm, joint, duration)
-
-
-@pytest.mark.parametrize("cut", [0.0, 2.0])
-def test_without_a_watchdog_a_failing_state_machine_is_replaced_by_damping_until_the_arm_is_down(cut, monkeypatch):
+@pytest.mark.parametrize("supply", [0.0, 2.0])
+def test_without_a_watchdog_a_failing_state_machine_is_replaced_by_damping_until_the_arm_is_down(supply, monkeypatch):
     monkeypatch.setattr(control_loop, "LOWERING", replace(LOWERING, fade=4.0, rest=4.0))
     arm = raised()
     arm.safety.step = fail
-    if cut:  # and the motors stay off when their supply returns
-        arm.clock.later(1.0, partial(cut_supply, arm, cut))
-        arm.clock.later(1.0 + cut, arm.forget)
+    if supply:  # is cut for so many s, and the motors stay off when their supply returns
+        arm.clock.later(1.0, partial(cut(supply), arm))
+        arm.clock.later(1.0 + supply, arm.forget)
     while arm.loop.cycle():
         pass
-    assert not cut or not arm.records["on"].any()
+    assert not supply or not arm.records["on"].any()
     arm.assert_down()
 
 
@@ -196,12 +204,6 @@ def test_the_thread_runs_the_cycles_until_the_loop_is_stopped():
     assert not loop.cycle()
 
 
-def test_our_own_frames_are_never_foreign():
-    arm = raised(echoes=True)
-    arm.run(1.0)
-    assert arm.bus.foreign_commands == 0 and "echo" in arm.bus.ignored and arm.state is State.ACTIVE
-
-
 # An arm whose motors are on two buses: one safety unit.
 
 FORMATS = pytest.mark.parametrize("wire_format", quick([MIT], [MIT, MIT_V3]), ids=["mit", "mit_v3"])
@@ -235,17 +237,12 @@ def silence(arm: CarriedArm, name: str) -> None:
     arm.wires[name].loss = 1.0
 
 
-def break_down(arm: CarriedArm, name: str) -> None:
-    arm.wires[name].refusal = BusError("no such device")
-    arm.wires[name].break_down(can.CanOperationError("No buffer space available"))
-
-
 def plug_in(arm: CarriedArm, name: str) -> None:
     arm.wires[name].loss, arm.wires[name].refusal, arm.wires[name].broken = 0.0, None, set()
 
 
 SILENT = (silence, FaultCode.MOTOR_SILENT, "no motor on {} replies: the bus is lost, or the supply is cut")
-BROKEN = (break_down, FaultCode.BUS_ERROR, "No buffer space available")
+BROKEN = (lose_bus, FaultCode.BUS_ERROR, "No buffer space available")
 
 
 LOST = [(MIT, SECOND, *SILENT), (MIT, FIRST, *SILENT), (MIT_V3, SECOND, *SILENT), (MIT, SECOND, *BROKEN)]
@@ -277,7 +274,7 @@ def test_motors_on_a_bus_that_fails_while_they_are_switched_off_are_not_taken_fo
     arm = raised(channel=ON_TWO)
     arm.safety.disable(arm.now)
     assert arm.run_until(lambda: arm.safety.watch.joints[2].power is Power.LEAVING)
-    break_down(arm, SECOND)
+    lose_bus(arm, SECOND)
     arm.run(0.5)
     assert not arm.loop.is_off
     plug_in(arm, SECOND)
@@ -328,3 +325,126 @@ def test_a_loop_can_end_at_once_while_no_motor_was_ever_heard(make: Callable[[],
     arm.device.bus_silent = False
     loop.stop()
     assert arm.motors_on == [is_on] * 4  # not known, so nothing was sent
+
+
+# Replies that are late, in virtual time: behind a queue between the bridge and its motors, or by lost frames.
+
+REAL_CYCLE = 1.0 / REAL_RATE  # s
+SPEED = 0.6  # rad/s
+
+
+class Line:
+    """A motor behind a line, asked in every cycle. delay: s for which a command is under way, with its reply.
+
+    lost: whether the command of a cycle is lost. asked: count of the commands that were sent.
+    """
+
+    def __init__(self, cycle: float = REAL_CYCLE) -> None:
+        self.requests, self.now, self.cycle = Requests(), 0.0, cycle
+        self.asked = 0
+        self._replies: list[float] = []
+
+    def run(self, duration: float, delay=lambda now: 0.0003, lost=lambda count: False) -> float:
+        """Let `duration` s pass, or less: until the replies are late; return how old the newest one is then."""
+        end = self.now + duration
+        while self.now < end and not self.requests.late:
+            if self.requests.may_send(self.now, self.cycle):
+                self.requests.sent(self.now, 1)
+                self.asked += 1
+                if not lost(self.asked):
+                    self._replies.append(self.now + delay(self.now))
+            self.now += self.cycle
+            for due in [due for due in self._replies if due <= self.now]:
+                self._replies.remove(due)
+                self.requests.replied(due)
+        return delay(self.now)
+
+
+@pytest.mark.parametrize("rate", [100.0, 250.0, 1000.0])
+def test_a_queue_that_grows_is_found_before_it_is_long(rate):
+    line = Line(1.0 / rate)
+    age = line.run(30.0, delay=lambda now: 0.0003 + 0.02 * now)
+    assert line.requests.late > AGE.longest and AGE.longest < age < 0.08
+
+
+def test_a_queue_that_is_there_at_once_is_found_and_forgotten_once_it_is_gone():
+    line = Line()
+    line.run(1.0)
+    line.run(1.0, delay=lambda now: 0.1)
+    assert line.requests.late > AGE.longest
+    for _ in range(20):  # what was under way arrives
+        line.now += REAL_CYCLE
+        line.requests.may_send(line.now, line.cycle)
+    line.run(1.0)
+    assert not line.requests.late
+
+
+NO_QUEUES = {
+    "a device that stands still for 60 ms, five times a second, and then answers all at once": (
+        (100.0, 250.0, 1000.0), lambda now: max(0.0003, 0.06 - now % 0.2), 10.0, 0),
+    "6 % of the frames lost": ((50.0, 250.0, 1000.0), lambda now: 0.0003, 20.0, 16),
+    "6 % of the frames lost, an adapter's timer of 16 ms": ((50.0, 250.0, 1000.0), lambda now: 0.016, 20.0, 16),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", NO_QUEUES)
+def test_what_is_no_queue_is_none_and_holds_up_few_commands(name):
+    rates, delay, duration, lost = NO_QUEUES[name]
+    for rate in rates:
+        line = Line(1.0 / rate)
+        line.run(duration, delay, lambda count: lost and count % lost == 0)
+        assert line.now == pytest.approx(duration, abs=0.1)
+        assert not line.requests.late
+        assert not lost or line.asked > 0.9 * duration * rate
+
+
+def test_a_motor_that_does_not_reply_is_still_asked_in_every_cycle_and_replies_that_come_back_are_no_queue():
+    line = Line()
+    line.run(1.0)
+    asked = line.asked
+    line.run(2.0, lost=lambda count: True)
+    assert line.asked - asked >= 2.0 / REAL_CYCLE - 6
+    line.run(5.0)
+    assert not line.requests.late
+
+
+def test_an_arm_behind_a_queue_that_grows_is_let_down_gently_before_the_queue_matters():
+    arm = raised_usual_arm()
+    begin, carry = arm.now, arm.wire.carry
+
+    def queue(sender, message, *sent):
+        is_command = sender is not None and message.arbitration_id and message.data[0] in (0x7F, 0x80)
+        if is_command:
+            arm.clock.later(0.02 * (arm.now - begin), lambda: carry(sender, message, *sent))
+        else:
+            carry(sender, message, *sent)
+
+    arm.wire.carry = queue
+    assert arm.run_until(lambda: arm.safety.state is not State.ACTIVE, 20.0)
+    # The pause that is to tell can itself make a motor silent.
+    assert arm.safety.fault.code in (FaultCode.REPLIES_LATE, FaultCode.MOTOR_SILENT)
+    assert 0.02 * (arm.now - begin) < 0.1
+    arm.run(8.0)
+    assert arm.fastest < SPEED
+
+
+def test_a_reading_is_as_old_as_the_command_that_it_answers():
+    arm = raised_usual_arm()
+    assert arm.run_until(lambda: all(arm.now - sample.time >= 0.0002 for sample in arm.bus.samples), 0.1)
+
+
+def test_a_send_that_fails_once_is_a_lost_frame_and_a_bus_that_fails_for_longer_a_fault(monkeypatch):
+    arm, send = raised_usual_arm(), VirtualBus.send
+
+    def failing(*_):
+        raise OSError(105, "No buffer space available")
+
+    for _ in range(10):
+        monkeypatch.setattr(VirtualBus, "send", failing)
+        arm.cycle()
+        monkeypatch.setattr(VirtualBus, "send", send)
+        arm.run(0.1)
+    assert arm.state is State.ACTIVE, arm.safety.fault
+    monkeypatch.setattr(VirtualBus, "send", failing)
+    arm.run(0.02)
+    assert (arm.state, arm.fault) == (State.LETTING_DOWN, FaultCode.BUS_ERROR)

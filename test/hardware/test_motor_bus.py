@@ -14,7 +14,7 @@ import pytest
 from can.interfaces.socketcan import SocketcanBus
 
 from exo_gravity.core.arm.paper import ArmModel
-from exo_gravity.core.errors import BusError, ParameterError
+from exo_gravity.core.errors import BusError
 from exo_gravity.core.motors.ak import MIT, MIT_V3, pack_reply
 from exo_gravity.core.motors.families import MOTORS
 from exo_gravity.core.motors.frames import (
@@ -35,8 +35,7 @@ from exo_gravity.sim import ArmConfig, Firmware, SimulatedArm, SimulatedDevice, 
 from exo_gravity.sim.virtual_time import VirtualBus, Wire
 
 from ..support.simulated_device import OFF, drive_of, frame, joints_of, sending
-from .arms import CYCLE, CarriedArm
-from .wires import motor_bus
+from .arms import CYCLE, CarriedArm, motor_bus
 
 AK60 = MOTORS["AK60-6"]
 MOUNTED = (("AK60-6", 1, 0.0), ("AK80-9", -1, 0.4), ("AK60-6", 1, -0.2), ("AK60-6", 1, 0.0))
@@ -92,13 +91,6 @@ def sent(bus: can.BusABC) -> list[tuple[int, bytes]]:
     return frames
 
 
-def test_a_bus_in_place_of_the_motors_ports_is_refused_at_once(other):
-    with pytest.raises(ParameterError, match=r"ports = .*must be the port or None for each of 4 motors"):
-        MotorBus(other, MOTORS_OF_ARM)
-    with pytest.raises(ParameterError, match="ports"):
-        MotorBus([None], MOTORS_OF_ARM)
-
-
 def test_each_motor_gets_the_frames_that_it_is_to_be_sent(bus, other):
     idle = (1, MOTORS_OF_ARM[0].command(0.0, 0.0))
     frames = {Send.ENTER: [(1, ENTER)], Send.EXIT: [(1, EXIT)], Send.CLEAR: [(1, ENTER), idle], Send.POLL: [idle]}
@@ -121,30 +113,28 @@ def commands(bus: can.BusABC, motor: JointMotor) -> list[MotorCommand]:
     return [unpack_command(motor.spec, data) for data in commanded]
 
 
-def test_a_motor_that_another_sender_commands_holds_its_joint_for_a_while(bus, device, other):
-    contested = MOTORS_OF_ARM[1]
+def answer(bus: MotorBus, other: can.BusABC, motor: JointMotor) -> MotorCommand:
+    """Return the command to `motor` of one more cycle."""
+    sent(other)
     bus.exchange(ON, now(bus) + 1.0)
-    end = now(bus) + CONTEST_TIME
+    return commands(other, motor)[-1]
+
+
+def test_a_motor_that_another_sender_commands_holds_its_joint_for_a_while(bus, device, other):
+    contested, end = MOTORS_OF_ARM[1], now(bus) + CONTEST_TIME
+    bus.exchange(ON, now(bus) + 1.0)
     other.send(frame(2, contested.command(1.0, 0.0)))
     bus.receive_until(end, lambda: bus.foreign_commands > 0)
-    sent(other)
-    bus.exchange(ON, now(bus) + 1.0)
-    command = commands(other, contested)[-1]
-    assert command.kp == pytest.approx(HOLD_STIFFNESS, rel=0.02)
-    assert command.kd == pytest.approx(DAMPING, abs=0.01)
-    assert command.position == pytest.approx(contested.motor_position(0.2), abs=0.01)
-    bus.exchange(ON, now(bus) + 1.0)
-    assert commands(other, MOTORS_OF_ARM[2])[-1].kp == 0.0
+    command = answer(bus, other, contested)
+    held = contested.motor_position(0.2), HOLD_STIFFNESS, DAMPING
+    assert (command.position, command.kp, command.kd) == pytest.approx(held, rel=0.02, abs=0.01)
+    assert answer(bus, other, MOTORS_OF_ARM[2]).kp == 0.0
     stiffness = [command.kp]
     while bus.is_contested:
-        sent(other)
-        bus.exchange(ON, now(bus) + 1.0)
-        stiffness.append(commands(other, contested)[-1].kp)
+        stiffness.append(answer(bus, other, contested).kp)
         bus.receive_until(now(bus) + 0.002)
     assert max(-np.diff(stiffness)) < 0.02 * HOLD_STIFFNESS  # ended at once, it would be a torque step
-    sent(other)
-    bus.exchange(ON, now(bus) + 1.0)
-    assert commands(other, contested)[-1].kp == 0.0
+    assert answer(bus, other, contested).kp == 0.0
 
 
 def test_after_a_foreign_set_zero_the_motor_damps_and_does_not_hold(bus, device, other):
@@ -269,20 +259,6 @@ def test_every_motor_is_read_and_a_v3_board_that_is_off_is_sent_only_its_exit(wi
     assert not bus.ignored
 
 
-def test_motors_of_both_formats_apply_their_torque_and_are_switched_off(wire, mixed, other) -> None:
-    joints, bus = joints_of(MIXED), mixed
-    device = play(wire, joints, BOARDS[0][1])
-    bus.exchange(sending(Send.ENTER), now(bus) + 1.0)
-    for _ in range(3):
-        assert bus.exchange(CARRYING, now(bus) + 1.0)
-    assert [motor.entered for motor in device.motors] == [True] * 4
-    assert [sample.effort for sample in bus.samples] == pytest.approx(CARRYING.effort, abs=0.02)
-    sent(other)
-    bus.exchange(sending(Send.EXIT), now(bus) + 1.0)
-    assert sent(other) == [frame for joint in joints for frame in joint.exit]
-    assert not device.powered
-
-
 V3_IDS = [joint.command_id for joint in joints_of(MIXED) if joint.wire_format is MIT_V3]
 # Foreign frames, and the IDs of the frames that oppose them.
 OPPOSED = [
@@ -361,13 +337,9 @@ def test_a_motor_of_any_temperature_gives_and_reports_the_torque_asked_for_withi
     true = bus.cycle(temperature)
     reported = np.array([sample.effort for sample in bus.samples])
     assert np.all(np.abs((true - EFFORT, reported - true)) <= 1.1 * HALF_A_CODE)
-
-
-def test_a_motor_that_reports_no_temperature_gives_its_torque_at_25_degrees():
-    bus = WarmBus(Firmware(reply_length=6))
-    bus.cycle(25.0, sending(Send.ENTER))
-    assert np.all(np.abs(bus.cycle(25.0) - EFFORT) <= 1.1 * HALF_A_CODE)
-    np.testing.assert_allclose(bus.cycle(65.0) / EFFORT, 1.0 + SLOPE * 40.0, atol=0.01)
+    bus = WarmBus(Firmware(reply_length=6))  # which reports none: as at 25 degC
+    bus.cycle(temperature, sending(Send.ENTER))
+    np.testing.assert_allclose(bus.cycle(temperature) / EFFORT, 1.0 + SLOPE * (temperature - 25.0), atol=0.01)
 
 
 def test_a_reading_that_jumps_moves_the_torque_no_faster_than_a_motor_warms():

@@ -43,9 +43,21 @@ from exo_gravity.sim.virtual_time import VirtualBus, VirtualClock
 from ..support.copies import copied
 from ..support.simulated_device import OFF, drive_of
 from ..support.thorough import quick
-from .arms import CYCLE, FIRST, MOTORS_OF_ARM, ON_TWO, SAFE_SPEED, SECOND, CarriedArm, NoWatchdog, raised_usual_arm
+from .arms import (
+    CYCLE,
+    FIRST,
+    MOTORS_OF_ARM,
+    ON_TWO,
+    SAFE_SPEED,
+    SECOND,
+    CarriedArm,
+    NoWatchdog,
+    Responder,
+    cut,
+    lose_bus,
+    raised_usual_arm,
+)
 from .arms import raised_arm as raised
-from .wires import Responder
 
 CHANNEL = f"can{os.getpid()}"  # other test runs share the network namespace
 CAN0 = ("socketcan", CHANNEL, {})
@@ -204,22 +216,33 @@ def test_a_bus_that_another_host_commands_is_refused_without_a_frame():
     owned.close()
 
 
-NEXT = [(take_over, FIRST, MIT), (OwnedBus, FIRST, MIT), (OwnedBus, ON_TWO, MIT), (OwnedBus, ON_TWO, MIT_V3)]
+def leave_no_notes(arm: CarriedArm) -> None:
+    notes_file(arm.on_bus.address).mkdir()
+
+
+NEXT = [
+    (take_over, FIRST, MIT, leave_on),
+    (OwnedBus, FIRST, MIT, leave_on),
+    (OwnedBus, FIRST, MIT, leave_no_notes),
+    (OwnedBus, ON_TWO, MIT, leave_on),
+    (OwnedBus, ON_TWO, MIT_V3, leave_on),
+]
 
 
 @pytest.mark.parametrize(
-    ("owner", "channel", "wire_format"),
-    quick(NEXT[:3], NEXT),
-    ids=["recovery", "next owner", "two buses", "two buses, V3 boards"],
+    ("owner", "channel", "wire_format", "leave"),
+    quick(NEXT[:4], NEXT),
+    ids=["recovery", "next owner", "notes that cannot be read", "two buses", "two buses, V3 boards"],
 )
-def test_the_arm_that_a_dead_owner_left_with_its_motors_on_is_let_down_first(owner, channel, wire_format):
+def test_the_arm_that_a_dead_owner_left_with_its_motors_on_is_let_down_first(owner, channel, wire_format, leave):
     arm, log = raised(channel=channel, wire_format=wire_format).leave(), []
-    leave_on(arm)
+    leave(arm)
     next_owner = owner(arm.on_bus, "the next owner", log.append, clock=arm.clock)
     (next_owner.close if owner is OwnedBus else next_owner.release)()
-    assert log == [ENDED, "the arm is down, its motors are off"]
+    said = ENDED if leave is leave_on else "it is not known what the motors apply, they may be on"
+    assert log[0].startswith(said) and log[1:] == ["the arm is down, its motors are off"]
     arm.assert_down()
-    assert [powered(part.address) for part in arm.on_bus.parts] == [False] * len(arm.on_bus.parts)
+    assert leave is leave_no_notes or not any(powered(part.address) for part in arm.on_bus.parts)
 
 
 def powered(address: Address) -> bool:
@@ -228,14 +251,6 @@ def powered(address: Address) -> bool:
     found = lock.notes.drive.powered
     lock.release()
     return found
-
-
-def test_an_arm_whose_notes_cannot_be_read_is_let_down_gently_from_what_its_motors_reply():
-    arm, log = raised().leave(), []
-    notes_file(arm.on_bus.address).mkdir()
-    OwnedBus(arm.on_bus, "the next owner", log.append, arm.clock).close()
-    assert log[0].startswith("it is not known what the motors apply, they may be on")
-    arm.assert_down()
 
 
 @pytest.mark.parametrize(
@@ -335,11 +350,6 @@ def test_a_motor_that_has_lost_its_power_is_not_pushed_by_the_noted_torque():
     assert arm.fastest < 0.01 and not arm.device.powered
 
 
-def lose_bus(arm: CarriedArm, name: str = FIRST) -> None:
-    arm.wires[name].refusal = BusError("no such device")
-    arm.wires[name].break_down(OSError("no such device"))
-
-
 def reach_again(arm: CarriedArm) -> None:
     arm.wire.refusal, arm.device.cut_off = None, (False,) * 4
 
@@ -370,8 +380,7 @@ def test_an_arm_that_is_reached_again_late_is_let_down_and_the_log_is_honest(los
 @pytest.mark.parametrize(("wire_format", "duration"), quick([(MIT_V3, 2.0)], [(MIT, 10.0), (MIT_V3, 2.0)]))
 def test_the_watchdog_leaves_motors_off_whose_supply_returns(wire_format: WireFormat, duration: float) -> None:
     arm = raised(wire_format=wire_format).leave()
-    for joint in range(4):
-        arm.schedule([(0.5, "unplugged", {"joint": joint, "duration": duration})], ACTS)
+    arm.clock.later(0.5, partial(cut(duration), arm))
     arm.clock.later(0.5 + duration, arm.forget)
     assert lowered(arm)
     assert not arm.records["on"].any()

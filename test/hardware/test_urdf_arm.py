@@ -1,12 +1,15 @@
 # Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
-"""Torques of arms from their URDF: against MuJoCo, Pinocchio and the exact law on the exoskeleton's own description.
+"""Arms from their URDF: against MuJoCo, Pinocchio and the exact law on the exoskeleton's own description.
 
 In descriptions that are incomplete but not empty, what changes the torque is used or refused, and the rest is named.
+What gravity needs of an arm of any number of joints is explained, bare or worn; and so is its inertia.
 """
 
 from __future__ import annotations
 
+import ctypes
 import re
+from collections.abc import Sequence
 from pathlib import Path
 
 import mujoco
@@ -16,10 +19,15 @@ import pytest
 import rtbdata
 
 from exo_gravity.core import STANDARD_GRAVITY, gravity_torque
-from exo_gravity.core.arm.tilt import Tilt
-from exo_gravity.core.compensation.settings import compensator_table, settings_of
+from exo_gravity.core.arm.interface import NO_LOAD, Payload
+from exo_gravity.core.arm.tilt import SIDES, Tilt
+from exo_gravity.core.compensation.settings import Settings, compensator_table, settings_of
 from exo_gravity.core.errors import ParameterError
 from exo_gravity.core.params import values_of
+from exo_gravity.core.safety.drive import Drive, Send
+from exo_gravity.core.safety.explain import GRAVITY, MotionMonitor
+from exo_gravity.core.safety.limits import DAMPING, Limits
+from exo_gravity.hardware.bus_lock import ArmNotes, DriveNotes
 from exo_gravity.hardware.urdf_arm import UrdfArm
 from exo_gravity.lab.inputs.arms import configured_arm
 from exo_gravity.lab.inputs.parameter_file import packaged_config
@@ -155,6 +163,8 @@ def branched() -> UrdfArm:
     arm = UrdfArm(BRANCHED, ["j1", "j3", "j4"])
     arm.follow(["j5"], [0.35])
     assert not arm.fixed
+    with pytest.raises(ParameterError, match="j5"):
+        arm.follow(["j1"], [1.0])  # which leaves the others where they were
     return arm
 
 
@@ -204,26 +214,12 @@ def test_one_pose_is_where_pinocchio_has_it_and_as_it_is_among_many():
         assert np.allclose(arm.pose(one[0].tolist())[0], places[n], rtol=0.0, atol=1e-12)
 
 
-def test_an_arm_that_is_turned_keeps_the_base_of_the_urdf():
-    arm = branched()
-    turned = arm.turned(np.full((3, 3), 0.01))
-    assert turned.base is arm.base
-
-
-def test_a_missing_joint_leaves_the_others_where_they_were():
-    arm = branched()
-    before = arm.places(np.zeros((1, 3)))
-    with pytest.raises(ParameterError, match="j5"):
-        arm.follow(["j1"], [1.0])
-    assert np.array_equal(arm.places(np.zeros((1, 3))), before)
-
-
 PANDA, WHOLE = ARMS["panda"][0].read_text(encoding="utf-8"), ARMS["panda"][1]
 KR16 = Path(rtbdata.__path__[0], "xacro/kuka_description/kuka_kr16/urdf/kr16_2.urdf").read_text(encoding="utf-8")
-GRAVITY = (
+FELT = (
     STANDARD_GRAVITY * np.array((0.12, -0.35, -0.929)) / np.linalg.norm((0.12, -0.35, -0.929))
 )  # m/s^2, in the root link
-TILT = Tilt.of_gravity("left", GRAVITY / STANDARD_GRAVITY)
+TILT = Tilt.of_gravity("left", FELT / STANDARD_GRAVITY)
 BALL = 0.01 * np.array((1.0, 1.0, 1.0, 0.0, 0.0, 0.0))  # kg m^2: ixx, iyy, izz, ixy, ixz, iyz
 SHAPE = "<visual><geometry><box size='0.1 0.1 0.1'/></geometry></visual>"
 DEPENDS = "<mimic joint='j1' multiplier='-0.7' offset='0.2'/>"
@@ -258,10 +254,10 @@ def test_positions_of_other_joints_that_are_reported_give_the_torque_of_the_whol
     for _ in range(50):
         theta = random.uniform(low, high)
         arm.follow([*WHOLE[::-1], "gripper"], [*theta[::-1], np.nan])
-        expected = whole.torque(theta, GRAVITY)[:3]
+        expected = whole.torque(theta, FELT)[:3]
         # Of the other joints only the last does not change the torque by more than 3 %: it is left at 0.
         assert np.allclose(arm.torque(theta[:3], TILT), expected, rtol=0.0, atol=0.03 * 50.0)
-        whole_but_last = whole.torque((*theta[:6], 0.0), GRAVITY)[:3]
+        whole_but_last = whole.torque((*theta[:6], 0.0), FELT)[:3]
         assert np.allclose(arm.torque(theta[:3], TILT), whole_but_last, rtol=0.0, atol=1e-9)
     assert arm.fixed == ()
 
@@ -286,7 +282,7 @@ def test_a_mimic_joint_carries_its_share_to_the_joint_that_it_follows() -> None:
     arm, mujoco, random = UrdfArm(text, ["j1", "j3"]), MujocoArm(text, ["j1", "j2", "j3"]), np.random.default_rng(2)
 
     def energy(first: float, last: float) -> float:
-        return mujoco.energy((first, -0.7 * first + 0.2, last), GRAVITY)
+        return mujoco.energy((first, -0.7 * first + 0.2, last), FELT)
 
     for first, last in random.uniform(-1.5, 1.5, (20, 2)):
         small = 1e-5
@@ -389,3 +385,118 @@ def test_an_effort_limit_that_no_joint_of_such_an_arm_has_is_not_used():
     assert settings_of(values_of(compensator_table(given), given), arm).max_effort == (30.0, 20.0, 30.0)
     with pytest.raises(ParameterError, match=r"max_effort of j2 = 0\.0: must be greater than 0"):
         settings_of(values_of(compensator_table(given), given | {"max_effort": [0.0] * 3}), arm)
+
+
+# Arms of any number of joints, and what they hold.
+
+
+def settings_for(text: str, names: Sequence[str], **given: object) -> Settings:
+    given = {"law": "urdf", "joint_names": list(names), "use_imu": False, **given}
+    return settings_of(values_of(compensator_table(given), given), UrdfArm(text, names, "hand"))
+
+
+def test_notes_of_an_arm_with_another_number_of_joints_are_no_torque_for_this_one() -> None:
+    notes = DriveNotes.from_buffer(bytearray(ctypes.sizeof(DriveNotes)))
+    assert not ArmNotes([notes] * 2).drive.powered
+    notes.note(Drive((1.0, 2.0, 3.0), (0.5,) * 3, (Send.COMMAND,) * 3, True))
+    assert ArmNotes([notes] * 3).drive == notes.drive
+    assert ArmNotes([notes] * 2).drive == Drive((0.0,) * 2, (DAMPING,) * 2, (Send.COMMAND,) * 2, True)
+
+
+@pytest.mark.parametrize("held", [{}, {"payload.mass": 1.5, "payload.cog": [0.02, -0.03, 0.05]}])
+@pytest.mark.parametrize("pitch", [0.0, 0.6])
+def test_a_wearer_and_a_load_are_carried_on_any_links_under_any_tilt(held: dict[str, object], pitch: float) -> None:
+    count = 5
+    text, names = random_chain(count, seed=11)
+    arm = UrdfArm(text, names, "hand")
+    mass, cog = [0.0, 1.1, 0.0, 0.7, 0.3], [0.0, 0.5 * arm.length[1], 0.0, 0.9 * arm.length[3], 0.2 * arm.length[4]]
+    stiffness, rest = [0.0, 1.2, 0.4, 2.0, 0.0], [0.0, 0.3, -0.2, 0.5, 0.0]
+    worn = {"wearer.mass": mass, "wearer.cog": cog, "mode": "zero_g", "support": 0.6}
+    worn |= {"wearer.joint_stiffness": stiffness, "wearer.joint_rest": rest}
+    settings = settings_for(text, names, max_effort=[1000.0] * count, **worn, **held)
+    config = UrdfConfig(
+        text=text,
+        joint_names=names,
+        hand="hand",
+        wearer_mass=[0.6 * m for m in mass],
+        wearer_cog=cog,
+        gravity=9.80665,
+        wearer_stiffness=[0.6 * k for k in stiffness],
+        wearer_rest=rest,
+    )
+    load = Payload(held["payload.mass"], held["payload.cog"]) if held else NO_LOAD
+    model, _ = config.models(load)
+    random, tilt = np.random.default_rng(5), Tilt.of("left", pitch, -0.5 * pitch)
+    model.opt.gravity = 9.80665 * np.array(tilt.gravity_in_trunk)
+    data = mujoco.MjData(model)
+    for _ in range(20):
+        data.qpos[:] = random.uniform(-0.6, 0.9, count)  # within reach of the wearer's joints
+        mujoco.mj_forward(model, data)
+        torque, reason = settings.torque(data.qpos.tolist(), tilt)
+        assert reason == "" and np.abs(torque - data.qfrc_bias + data.qfrc_passive).max() < 1e-9
+    bare = settings.robot
+    assert settings.mass == pytest.approx(bare.total_mass + 0.6 * sum(mass) + load[0])
+
+
+def test_inertia_and_momentum_agree_with_mujocos_and_their_balance_holds() -> None:
+    count = 6
+    text, names = random_chain(count, seed=3)
+    arm = UrdfArm(text, names, "hand").with_payload(0.8, (0.05, 0.0, 0.02))
+    config = UrdfConfig(text=text, joint_names=names, hand="hand", rotor_inertia=(0.0,) * count)
+    model, _ = config.models(Payload(0.8, (0.05, 0.0, 0.02)))
+    model.opt.gravity = np.zeros(3)
+    model.dof_damping[:] = model.dof_frictionloss[:] = 0.0
+    data, random = mujoco.MjData(model), np.random.default_rng(4)
+    whole = np.zeros((count, count))
+    for _ in range(20):
+        theta, velocity, acceleration = (random.uniform(-1.5, 1.5, count) for _ in range(3))
+        data.qpos[:], data.qvel[:] = theta, velocity
+        mujoco.mj_forward(model, data)
+        for row, one in zip(whole, np.eye(count), strict=True):
+            mujoco.mj_mulM(model, data, row, one)
+        np.testing.assert_allclose(
+            arm.links.matrix(theta), whole, rtol=0.0, atol=1e-6
+        )  # a point of mass has some inertia
+        expected = whole @ acceleration + data.qfrc_bias
+        np.testing.assert_allclose(arm.links.torque(theta, velocity, acceleration), expected, rtol=0.0, atol=1e-5)
+        momentum, drift = arm.links.momentum(theta, velocity)
+        np.testing.assert_allclose(momentum, whole @ velocity, rtol=0.0, atol=1e-5)
+        # p' = tau + C^T v along any motion, which is what the observer relies on
+        before, after = (
+            arm.links.momentum(theta + s * velocity + s * s / 2.0 * acceleration, velocity + s * acceleration)[0]
+            for s in (-1e-5, 1e-5)
+        )
+        balance = np.add(arm.links.torque(theta, velocity, acceleration), drift)
+        np.testing.assert_allclose(np.subtract(after, before) / 2e-5, balance, rtol=0.0, atol=1e-5)
+        assert np.all(1.0 / np.diag(np.linalg.inv(whole)) > 0.9 * np.array(arm.links.least))
+
+
+# Torque that gravity cannot account for.
+
+CYCLE = 0.004
+
+
+def limits_of(arm: UrdfArm, **changes: object) -> Limits:
+    """What `budget` prints for the arm."""
+    found, count = arm.skeleton(), len(arm.names)
+    rows = {f"{name}_{axis}": tuple(column.round(4)) for name, of in (("axis", found.axes), ("link", found.ways))
+            for axis, column in zip("xyz", of.T, strict=True)}  # fmt: skip
+    addition = np.minimum(10.0, GRAVITY * found.beside)
+    limits = {"max_effort": (500.0,) * count, "position_min": (-3.0,) * count, "position_max": (3.0,) * count}
+    moments = {"largest_moment": tuple(found.moments), "largest_addition": tuple(addition)}
+    return Limits(arm.names, **{**limits, **moments, **rows, "max_command": (500.0,) * count, **changes})
+
+
+@pytest.mark.parametrize("side", SIDES)
+@pytest.mark.parametrize("count", [1, 2, 3, 5, 6, 7, 9])
+def test_what_mujoco_needs_of_any_chain_is_explained_in_any_pose_at_any_tilt(count: int, side: str) -> None:
+    text, names = random_chain(count, seed=count)
+    arm, truth, random = UrdfArm(text, names, "hand"), MujocoArm(text, names), np.random.default_rng(count)
+    monitor, beside = MotionMonitor(limits_of(arm)), GRAVITY * arm.skeleton().beside
+    for _ in range(50):
+        theta, (pitch, roll) = random.uniform(-3.0, 3.0, count), random.uniform(-1.0, 1.0, 2)
+        tilt = Tilt.of(side, pitch, roll)
+        monitor.follow(tilt, None)
+        low, high = monitor.explained(theta.tolist())
+        torque = truth.torque(theta, 9.80665 * np.array(tilt.gravity_in_trunk))
+        assert np.all(low - beside - 0.01 <= torque) and np.all(torque <= high + beside + 0.01)

@@ -30,9 +30,8 @@ from exo_gravity.sim.virtual_time import VirtualClock
 from ..support.launched_nodes import children
 from ..support.simulated_device import OFF, drive_of
 from ..support.waiting import PATIENCE, wait_until
-from .arms import CYCLE, SimulatedRig
+from .arms import CYCLE, Responder, SimulatedRig
 from .arms import raised_arm as raised
-from .wires import Responder
 
 LET_DOWN = ["letting the arm down", "the arm is down, its motors are off"]
 

@@ -1,8 +1,6 @@
 # Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
 """A trial without a bus, in simulated time: its script, its virtual wearer, and the arm, always let down at the end."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np
@@ -145,30 +143,6 @@ def test_steps_of_the_trunk_have_an_angle_or_only_a_duration_and_one_of_the_hand
         Step("sit", 2.0),
         Step("load", 1.0, (2.0,)),
     ]
-
-
-@pytest.mark.parametrize(
-    ("content", "name"),
-    [
-        (None, "script"),
-        ({"name": "x", "steps": [], "extra": 1}, "script"),
-        *(({"name": name, "steps": [{"hold": 1}]}, "name") for name in ("/tmp/x", "../x", "", None, "a\nb", "x" * 101)),
-        ({"name": "x", "steps": []}, "steps"),
-        ({"name": "x", "steps": [{"hold": 1, "over": 1}]}, "steps[0]"),
-        ({"name": "x", "steps": [{"hold": "long"}]}, "steps[0].hold"),
-        ({"name": "x", "steps": [{"move": [0, 0, 0, 0], "over": 1}, {"move": [0, 0, 0], "over": 1}]}, "steps[1].move"),
-        ({"name": "x", "steps": [{"move": [0, 0, 0, 90], "over": 1}]}, "steps[0].move"),
-        ({"name": "x", "steps": [{"push": [0, 0, 0, 1], "over": -1}]}, "steps[0].over"),
-        ({"name": "x", "steps": [{"bow": 45, "over": 3}]}, "steps[0].bow"),
-        ({"name": "x", "steps": [{"bow": 0.5}]}, "steps[0]"),
-        ({"name": "x", "steps": [{"walk": 0.5}]}, "steps[0].walk"),
-        ({"name": "x", "steps": [{"load": 200, "over": 1}]}, "steps[0].load"),
-    ],
-)
-def test_an_invalid_entry_is_named(content, name):
-    with pytest.raises(ParameterError) as caught:
-        TrialScript.parse(content)
-    assert caught.value.name == name
 
 
 @pytest.mark.parametrize(

@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from exo_gravity.core.errors import ParameterError
 from exo_gravity.sim import ImuConfig, SimulatedImu
 from exo_gravity.sim.script import Step
 from exo_gravity.sim.trunk_motion import HIP_TO_SHOULDER, SitDown, TrunkState, Turn, Walk, motion_of
@@ -47,22 +46,16 @@ def test_rates_and_accelerations_are_the_derivatives_of_the_tilt_and_a_motion_be
         np.testing.assert_allclose(turned, ((0, -z, y), (z, 0, -x), (-y, x, 0)), atol=1e-5)
         spun_up = np.subtract(after.angular_velocity, before.angular_velocity) / (2 * step)
         np.testing.assert_allclose(spun_up, state.angular_acceleration, atol=1e-4)
+        if name in ("bow", "lean"):  # the shoulder turns about the hips
+            shoulder = (orientation(motion.at(t + n * 1e-4)) @ HIP_TO_SHOULDER for n in (-1, 0, 1))
+            pushed = orientation(state).T @ np.diff([*shoulder], 2, axis=0)[0] / 1e-8
+            np.testing.assert_allclose(state.acceleration, pushed, atol=1e-4)
     for state in (motion.at(0.0), motion.at(duration)):
         np.testing.assert_allclose((*state[2:6], *state.acceleration), 0.0, atol=1e-9)
     np.testing.assert_allclose(motion.at(0.0)[:2], START, atol=1e-12)
 
 
-@pytest.mark.parametrize("name", ["bow", "lean"])
-def test_a_turning_trunk_accelerates_its_shoulder_about_the_hips(name):
-    motion, duration = MOTIONS[name]
-    step = 1e-4
-    for t in np.linspace(0.1, duration - 0.1, 20):
-        before, here, after = (orientation(motion.at(t + n * step)) @ HIP_TO_SHOULDER for n in (-1, 0, 1))
-        acceleration = orientation(motion.at(t)).T @ (before - 2 * here + after) / step**2
-        np.testing.assert_allclose(motion.at(t).acceleration, acceleration, atol=1e-4)
-
-
-def test_walking_accelerates_the_trunk_as_much_as_measured_and_goes_nowhere_but_forward_also_bent():
+def test_walking_accelerates_the_trunk_as_much_as_measured_and_goes_nowhere_but_forward():
     states = [Walk((0.0, 0.0), 60.0).at(t) for t in np.arange(2.0, 58.0, 0.01)]
     world = np.array([orientation(state) @ state.acceleration for state in states]) / G
     forward, lateral, vertical = np.sqrt(np.mean(world**2, axis=0))
@@ -70,9 +63,6 @@ def test_walking_accelerates_the_trunk_as_much_as_measured_and_goes_nowhere_but_
     np.testing.assert_allclose(world.mean(axis=0), 0.0, atol=0.002)
     pitch, roll = np.degrees([state[:2] for state in states]).T
     assert 1.9 < np.ptp(pitch) < 2.1 and 3.9 < np.ptp(roll) < 4.1
-    upright, bent = (Walk(tilt, 8.0, pitch_sway=0.0).at(4.0) for tilt in ((0.0, 0.0), (0.7, 0.2)))
-    there = orientation(upright) @ upright.acceleration
-    np.testing.assert_allclose(orientation(bent) @ bent.acceleration, there, atol=1e-9)
 
 
 def test_the_shock_of_sitting_down_stops_the_fall():
@@ -162,13 +152,3 @@ def test_readings_lag_by_the_delay(delay):
     times = np.arange(100) / 100.0
     rates = [imu.sample(TrunkState(0.0, 0.0, roll_rate=t))[0][0] for t in times]
     np.testing.assert_allclose(rates[10:], times[10:] - delay, atol=1e-12)
-
-
-@pytest.mark.parametrize(
-    "change",
-    [{"rotation_trunk_from_imu": (0, 0, 0, 2)}, {"rate": 0.0}, {"gravity": -1.0}, {"delay": -0.1}],
-)
-def test_an_impossible_configuration_is_rejected_by_name(change):
-    with pytest.raises(ParameterError) as caught:
-        ImuConfig(**change)
-    assert [caught.value.name] == list(change)

@@ -22,7 +22,7 @@ from exo_gravity.sim import Firmware, SimulatedArm, SimulatedDevice
 from exo_gravity.sim.motors import simulated
 from exo_gravity.sim.virtual_time import Wire
 
-from ...hardware.wires import Responder
+from ...hardware.arms import Responder
 from ...support.simulated_device import SPECS, frame, make_device
 
 ADDRESS = ("wire", f"of process {os.getpid()}", {})
