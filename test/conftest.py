@@ -6,8 +6,6 @@ COLCON=1, a test file that needs a missing package is therefore left out, and th
 Elsewhere (`make test`) a missing package is an error.
 """
 
-from __future__ import annotations
-
 import importlib
 import os
 from collections import Counter

@@ -1,8 +1,6 @@
 # Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
 """What programs read: docs/keys.md has every word of the code and no other, and nothing of ours parses a sentence."""
 
-from __future__ import annotations
-
 import copy
 import pickle
 import re

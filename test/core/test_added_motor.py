@@ -4,8 +4,6 @@
 Entry points are looked up once, and so forgotten before and after.
 """
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

@@ -4,8 +4,6 @@
 Against Pinocchio, MuJoCo, the Robotics Toolbox, and the paper's equations copied by hand.
 """
 
-from __future__ import annotations
-
 import math
 from math import cos, sin
 from typing import Any

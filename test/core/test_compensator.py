@@ -1,8 +1,6 @@
 # Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
 """The compensator through time: late tilts, changes of load, the trunk's motion, a command that fades, more support."""
 
-from __future__ import annotations
-
 import itertools
 import math
 from dataclasses import replace

@@ -1,8 +1,6 @@
 # Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
 """Springs at the joints, of the robot and of its wearer, and joints that are springs: law and MuJoCo's arm agree."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import mujoco

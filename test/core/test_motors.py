@@ -5,8 +5,6 @@ Bytes are worked out by hand from the
 documents that core/motors names, or come from public drivers.
 """
 
-from __future__ import annotations
-
 import json
 import math
 import pickle

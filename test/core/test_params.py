@@ -1,8 +1,6 @@
 # Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
 """Parameters: live changes, names of earlier versions, what follows from them, and values that nothing has."""
 
-from __future__ import annotations
-
 import json
 import math
 import random

@@ -6,8 +6,6 @@ joints' own friction: what they give is bounded by what that takes. The outer lo
 faded within 100 ms when it is not.
 """
 
-from __future__ import annotations
-
 import math
 import random
 from collections import deque

@@ -1,8 +1,6 @@
 # Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
 """The tilt of the trunk: its angles, its messages, how sure it is, and the motion that the arm feels."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

@@ -8,8 +8,6 @@ unsafe while the machine itself stands still is played again; if it still does, 
 prints its table too, and the exit code is 130.
 """
 
-from __future__ import annotations
-
 import argparse
 import contextlib
 import json

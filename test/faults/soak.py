@@ -9,8 +9,6 @@ The exit code is 1 if a row was unsafe, the recording has losses or gaps, or a n
 MAX_GROWTH.
 """
 
-from __future__ import annotations
-
 import argparse
 import random
 import sys

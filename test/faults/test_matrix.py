@@ -1,8 +1,6 @@
 # Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
 """The fault matrix in virtual time: every row is safe, by the arm's true motion, and deliberate defects are seen."""
 
-from __future__ import annotations
-
 from contextlib import suppress
 
 import pytest

@@ -1,8 +1,6 @@
 # Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
 """A folder for the notes of buses."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import pytest

@@ -4,8 +4,6 @@
 A serial adapter (slcan) on a pseudo-terminal passes frames of both formats, and may be unplugged and come back.
 """
 
-from __future__ import annotations
-
 import contextlib
 import os
 import pty

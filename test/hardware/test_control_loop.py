@@ -4,8 +4,6 @@
 Also where its motors are on two buses, where another owner left them on, and where replies are late.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import replace
 from functools import partial

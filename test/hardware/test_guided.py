@@ -4,8 +4,6 @@
 With a person's arm in the device: judged by the true motion of the joints, and by how fast the motors drive them.
 """
 
-from __future__ import annotations
-
 import math
 from functools import partial
 

@@ -4,8 +4,6 @@
 Motors of V1, V2 and V3 boards, and warm ones.
 """
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import can

@@ -5,8 +5,6 @@ The boards of AK motors, Damiao motors on classic CAN and CAN FD, both on one bu
 At the start, signs are proven slowly, and exchanged IDs are found; elastic joints are carried.
 """
 
-from __future__ import annotations
-
 import itertools
 from collections import deque
 from collections.abc import Callable, Mapping

@@ -1,8 +1,6 @@
 # Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
 """One owner per bus and host, and what becomes of the arm that a dead one left with its motors on; in virtual time."""
 
-from __future__ import annotations
-
 import itertools
 import os
 import re

@@ -5,8 +5,6 @@ In descriptions that are incomplete but not empty, what changes the torque is us
 What gravity needs of an arm of any number of joints is explained, bare or worn; and so is its inertia.
 """
 
-from __future__ import annotations
-
 import ctypes
 import re
 from collections.abc import Sequence

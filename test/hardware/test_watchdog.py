@@ -4,8 +4,6 @@
 What happens after both have died: test_ownership.py in virtual time, nodes/test_stack.py with processes.
 """
 
-from __future__ import annotations
-
 import contextlib
 import fcntl
 import os

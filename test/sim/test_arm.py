@@ -1,8 +1,6 @@
 # Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
 """The mechanics of the simulated arm: weight, friction, stops, a moving base, elastic joints."""
 
-from __future__ import annotations
-
 import math
 
 import mujoco

@@ -1,8 +1,6 @@
 # Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
 """The judge sees each way in which an arm can be let down badly, in made records; the device's own are true."""
 
-from __future__ import annotations
-
 from types import SimpleNamespace
 from typing import Any
 

@@ -1,8 +1,6 @@
 # Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
 """Simulated motors of each family and firmware: frames in, and the state, the reply and the torque out."""
 
-from __future__ import annotations
-
 import struct
 from dataclasses import replace
 from typing import Any

@@ -1,8 +1,6 @@
 # Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
 """The simulated trunk and its IMU: motions agree with their own derivatives, readings with the trunk's motion."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

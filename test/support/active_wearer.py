@@ -5,8 +5,6 @@ A behaviour is a function of the time in s since it began and of the arm's true 
 rad/s; it returns the wearer's torque (n,) in Nm on the joints.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 
 from exo_gravity.core.numbers import NO_TORQUE

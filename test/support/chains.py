@@ -1,8 +1,6 @@
 # Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
 """Serial arms at random, as URDFs: any axes, any centres of gravity, fixed joints between some of the links."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 

@@ -1,8 +1,6 @@
 # Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
 """A compensator that a test drives through time."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from typing import Any
 

@@ -1,8 +1,6 @@
 # Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
 """A copy of an arm in virtual time, with all that runs it: tests that begin alike bring one arm there, once."""
 
-from __future__ import annotations
-
 import copy
 import copyreg
 import functools

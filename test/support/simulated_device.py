@@ -1,8 +1,6 @@
 # Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
 """A simulated device with default motors, and the frames that a bridge sends to it."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from typing import Any
 

@@ -1,8 +1,6 @@
 # Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
 """Reads the truth log of a simulated device while it grows; exo_gravity/sim/truth.py describes the format."""
 
-from __future__ import annotations
-
 from bisect import bisect_left
 from pathlib import Path
 
