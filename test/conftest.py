@@ -6,7 +6,8 @@ COLCON=1, a test file that needs a missing package is therefore left out, and th
 Elsewhere (`make test`) a missing package is an error.
 """
 
-import importlib
+from __future__ import annotations
+
 import os
 from collections import Counter
 from collections.abc import Generator, Iterator
@@ -16,13 +17,11 @@ import pytest
 
 from exo_gravity.hardware.clock import favour
 
-from .support import ROOT, UNDER_COLCON
 from .support.ports import own_domain
+from .support.selection import UNDER_COLCON, missing_packages
 from .support.stalls import Machine
 
 LINTERS = "test_linters.py"  # elsewhere `make lint` runs it
-# What a file that names this starts as a process.
-STARTED = {"launched_nodes": "exo_gravity.nodes.simulator", "emg_assistance": "examples.emg_assistance"}
 left_out: Counter[str] = Counter()
 
 os.environ["ROS_DOMAIN_ID"] = str(own_domain())
@@ -57,14 +56,9 @@ def pytest_ignore_collect(collection_path: Path) -> bool | None:
         return True
     if not UNDER_COLCON or file == Path(__file__) or file.suffix != ".py" or not file.is_file():
         return None
-    own, text = ".".join(file.relative_to(ROOT).with_suffix("").parts), file.read_text(encoding="utf-8")
-    try:
-        for module in (own, *(started for word, started in STARTED.items() if word in text)):
-            importlib.import_module(module)
-    except ModuleNotFoundError as error:
-        left_out[str(error.name).partition(".")[0]] += 1
-        return True
-    return None
+    missing = missing_packages(file)
+    left_out.update(missing)
+    return True if missing else None
 
 
 @pytest.hookimpl(trylast=True)  # once `-m` and `-k` have selected

@@ -2,13 +2,11 @@
 """What the tests share."""
 
 import csv
-import os
 from pathlib import Path
 
 from exo_gravity.core import ArmModel
 
 ROOT = Path(__file__).parents[2]  # of the checkout; processes that run `-m test.support.X` start here
-UNDER_COLCON = "COLCON" in os.environ  # on a ROS host, which has what package.xml names
 CONFIG = ROOT / "config"
 DATA = ROOT / "test" / "data"
 PARTS = ("shoulder_rotation", "shoulder_abduction", "shoulder_flexion", "elbow_flexion")  # of an arm, for each joint

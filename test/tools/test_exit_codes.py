@@ -24,7 +24,8 @@ from exo_gravity.lab import packages
 from exo_gravity.lab.processes import node_modules
 from exo_gravity.tools.cli import exit_code
 
-from ..support import CONFIG, UNDER_COLCON
+from ..support import CONFIG
+from ..support.selection import UNDER_COLCON
 from ..support.thorough import quick
 
 EXO = str(CONFIG / "exo.yaml")
