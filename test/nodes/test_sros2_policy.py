@@ -112,17 +112,14 @@ def test_only_one_node_of_an_arm_may_publish_what_its_torque_depends_on_and_its_
 def test_the_text_is_an_access_control_policy_of_version_0_2_0_with_these_rules():
     root = ElementTree.fromstring(SCRIPT["text_of"](POLICY))
     assert (root.tag, root.attrib, [child.tag for child in root]) == ("policy", {"version": "0.2.0"}, ["enclaves"])
-    read = {}
-    for enclave in root[0]:
-        ((profile,),) = enclave
-        assert (enclave.tag, enclave[0].tag, profile.tag) == ("enclave", "profiles", "profile")
+    read, items = {}, {"publish": "topic", "subscribe": "topic", "reply": "service", "request": "service"}
+    for enclave in root.iterfind("enclaves/enclave"):
+        (profile,) = enclave.iterfind("profiles/profile")
         assert f"{profile.get('ns').rstrip('/')}/{profile.get('node')}" == enclave.get("path")
-        rules = read[enclave.get("path")] = {kind: set() for kind in NO_RULES}
-        for group in profile:
-            ((kind, allowed),) = group.attrib.items()
-            item = {"publish": "topic", "subscribe": "topic", "reply": "service", "request": "service"}[kind]
-            assert allowed == "ALLOW" and group.tag == f"{item}s" and {child.tag for child in group} == {item}
-            rules[kind] |= {child.text for child in group}
+        read[enclave.get("path")] = {
+            kind: {child.text for child in profile.iterfind(f"{item}s[@{kind}='ALLOW']/{item}")}
+            for kind, item in items.items()
+        }
     assert read == POLICY
     names = [name for rules in read.values() for kind in rules.values() for name in kind]
     assert all(name.startswith("/") and not set(name) & set("*?[]~ \n") for name in names)

@@ -15,13 +15,10 @@ from unittest.mock import Mock
 import pytest
 
 from exo_gravity.core.errors import ParameterError
-from exo_gravity.lab.anfis import text_of
-from exo_gravity.lab.inputs.node_checks import check_nodes
 from exo_gravity.lab.inputs.parameter_file import load, stages
 from exo_gravity.lab.processes import DELAY, Launcher, chosen, command_of, node_modules, stop_on_signals, wearers
 from exo_gravity.tools import launcher
 
-from ..core.test_anfis import law
 from ..support import CONFIG, ROOT
 
 SIM = CONFIG / "sim.yaml"
@@ -49,14 +46,6 @@ def test_the_node_names_are_the_modules_with_an_entry_point_and_help_lists_them(
     code, out, _ = run_tool("launcher", "--help")
     text = " ".join(out.split())
     assert code == 0 and "/right/can_bridge" in text and ", ".join(node_modules()) in text
-
-
-def test_a_model_in_the_home_folder_is_found_as_the_node_finds_it(tmp_path, monkeypatch):
-    monkeypatch.setenv("HOME", str(tmp_path))
-    (tmp_path / "model.json").write_text(text_of(law()))
-    nodes = load(SIM)
-    nodes["/right/compensator"] |= {"law": "anfis", "anfis_file": "~/model.json"}
-    check_nodes(nodes)
 
 
 def test_a_node_is_run_from_this_package_whatever_lies_in_the_folders(tmp_path, monkeypatch):
