@@ -15,12 +15,11 @@ from rich.console import Console
 os.environ["OMP_NUM_THREADS"] = "1"
 
 from .laws import measure_laws
-from .loops import measure_loops
+from .loop import Progress, measure_loops
 from .recordings import measure_recordings
 from .starts import measure_starts
 from .table import Row, save, show
 
-Progress = Callable[[str], None]
 PARTS: dict[str, Callable[[bool, Progress], Iterator[Row]]] = {
     "law": lambda quick, progress: measure_laws(quick),
     "loop": measure_loops,

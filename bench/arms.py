@@ -5,14 +5,13 @@ The simulated arm is the one that the compensator assumes. Its friction is the s
 study's kind.
 """
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Mapping
+from dataclasses import dataclass
 from functools import cache, cached_property
 from typing import Any, NamedTuple, TypeVar
 
 from exo_gravity.core.arm.wearer import LinkLoad, Wearer
 from exo_gravity.core.motors.ak import V3_RANGES
-from exo_gravity.core.motors.joint_motor import JointMotor
 from exo_gravity.core.safety.limits import Limits, limits_of
 from exo_gravity.lab.inputs.arms import ConfiguredArm, node_values, read_arm
 from exo_gravity.lab.inputs.parameter_file import Nodes, load, packaged_config
@@ -63,14 +62,9 @@ class PlayedArm:
         return read_arm(self.nodes, "/right")
 
     @property
-    def motors(self) -> tuple[JointMotor, ...]:
-        """Its motors."""
-        return self.carried.motors
-
-    @property
     def has_v3(self) -> bool:
         """Whether its motors also come with V3 boards."""
-        return all(motor.spec.name in V3_RANGES for motor in self.motors)
+        return all(motor.spec.name in V3_RANGES for motor in self.carried.motors)
 
     @property
     def has_imu(self) -> bool:
@@ -109,11 +103,6 @@ def of_family(kind: type[Motor], family: str) -> type[Motor]:
     """Return a `kind` of simulated motor for motors of a family."""
     own = class_of(family)
     return kind if issubclass(kind, own) else type(f"{kind.__name__} {own.__name__}", (kind, own), {})
-
-
-def on_boards(motors: Sequence[JointMotor], board: Any) -> tuple[JointMotor, ...]:
-    """Return AK motors with boards of this wire format."""
-    return tuple(replace(motor, spec=board.ranged(motor.spec), wire_format=board) for motor in motors)
 
 
 PAPER = PlayedArm(

@@ -2,7 +2,7 @@
 """What the studies of random devices share: their options, the devices one on each core, and the table of figures."""
 
 import argparse
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from pathlib import Path
 from typing import NamedTuple, TypeVar
 
@@ -43,14 +43,10 @@ def run_study(
         results[outcome.item] = outcome.result
         print(f"{len(results)} of {options.devices}, device {outcome.item}: {told(outcome.result)}", flush=True)
     rows = verdict([results[seed] for seed in sorted(results)])
-    text = as_markdown(rows)
+    lines = ["| what | shown | limit | |", "|---|---|---|---|"]
+    lines += (f"| {r.what} | {r.shown} | {r.limit} | {'' if r.held else 'missed'} |" for r in rows)
+    text = "\n".join(lines)
     print(text)
     options.output.parent.mkdir(parents=True, exist_ok=True)
     options.output.write_text(f"{text}\n", encoding="utf-8")
     return 0 if all(row.held for row in rows) else 1
-
-
-def as_markdown(rows: Sequence[Row]) -> str:
-    """Return the table in Markdown."""
-    lines = ["| what | shown | limit | |", "|---|---|---|---|"]
-    return "\n".join([*lines, *(f"| {r.what} | {r.shown} | {r.limit} | {'' if r.held else 'missed'} |" for r in rows)])

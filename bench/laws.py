@@ -2,7 +2,8 @@
 """The law, against compiled Pinocchio and the Robotics Toolbox, all called from Python on the same arm and poses."""
 
 from collections.abc import Iterator
-from typing import Any, cast
+from functools import partial
+from typing import cast
 
 import numpy as np
 
@@ -47,24 +48,17 @@ def measure_laws(quick: bool) -> Iterator[Row]:
     )
     yield row("law, one pose: Pinocchio", ours, pinocchio)
     yield row("law, one pose: Robotics Toolbox", ours, toolbox)
-
-    def pinocchio_loop() -> None:
-        for pose in poses[:LOOP]:
-            pin.computeGeneralizedGravity(model, data, pose)
-
-    def toolbox_loop() -> None:
-        for pose in poses[: LOOP // 100]:
-            robot.gravload(pose)
-
     pool, columns = pin.ModelPool(model, 1), np.asfortranarray(poses.T)
-    still = np.zeros_like(columns)
-
-    def compiled_loop() -> Any:
-        return pin.rneaInParallel(1, pool, columns, still, still)
-
+    compiled_loop = partial(pin.rneaInParallel, 1, pool, columns, *[np.zeros_like(columns)] * 2)
     np.testing.assert_allclose(gravity_torque(arm, poses), compiled_loop().T, atol=1e-12)
     ours, *peers = race(
-        ((lambda: gravity_torque(arm, poses), 1), (pinocchio_loop, 1), (compiled_loop, 1), (toolbox_loop, 1)), blocks
+        (
+            (lambda: gravity_torque(arm, poses), 1),
+            (lambda: [pin.computeGeneralizedGravity(model, data, pose) for pose in poses[:LOOP]], 1),
+            (compiled_loop, 1),
+            (lambda: [robot.gravload(pose) for pose in poses[: LOOP // 100]], 1),
+        ),
+        blocks,
     )
     names = "Pinocchio in a loop", "Pinocchio's compiled loop, one thread", "Robotics Toolbox in a loop"
     for name, peer, count in zip(names, peers, (LOOP, POSES, LOOP // 100), strict=True):
@@ -93,9 +87,7 @@ def _measure_urdf(file: str, blocks: int) -> Iterator[Row]:
     poses = np.random.default_rng(1).uniform(-1.5, 1.5, (POSES, count))
     upright = np.tile(Tilt.of("left").direction, (POSES, 1))
 
-    def loop() -> list[Any]:
-        return [pin.computeGeneralizedGravity(model, data, pose) for pose in poses[:LOOP]]
-
+    loop = lambda: [pin.computeGeneralizedGravity(model, data, pose) for pose in poses[:LOOP]]  # noqa: E731
     np.testing.assert_allclose(arm.gain * loop(), arm.torques(poses[:LOOP], upright[:LOOP]), atol=1e-12)
     ours, peer = race(((lambda: arm.torques(poses, upright), 1), (loop, 1)), blocks)
     name = f"law of a URDF with {count} joints"

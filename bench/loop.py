@@ -1,9 +1,10 @@
 # Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
-"""One run of a loop from bus to bus, timed by an independent listener.
+"""The rows of the loop from bus to bus, timed by an independent listener.
 
 The kinds of loop: the package's nodes, can_bridge and compensator of an arm in one process, one Python process without
-ROS, and bare rclpy. All run on the same simulated device, which a virtual
-wearer moves to and fro, with the same law and rate. The arms are those of a file in config.
+ROS, and bare rclpy. All run on the same simulated device, which a virtual wearer moves to and fro, with the same law
+and rate. The arms are those of a file in config. The kinds take turns, so that other load on the machine affects all of
+them alike; a row compares run by run.
 """
 
 import contextlib
@@ -14,18 +15,21 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 import yaml
 
+from exo_gravity.core.safety.guidance import GUIDANCE
+from exo_gravity.core.safety.start import START_GATE
 from exo_gravity.lab.inputs.parameter_file import load, packaged_config
 from exo_gravity.lab.processes import Launcher
 
 from .peers import DirectArm
-from .timing import LoopTiming, analyse, split_cycles
+from .table import Row
+from .timing import LoopTiming, analyse, percentile, split_cycles
 
 ONE_ARM, BOTH_ARMS, SEVEN_JOINTS = "sim.yaml", "sim_both.yaml", "seven_joints.yaml"
 PAPERS = [0.5, 1.0, 0.9, 1.0], [-0.3, 0.4, 0.2, 0.3]
@@ -40,21 +44,15 @@ SETTLING = 0.5  # s of movement before the measurement
 OURS = ("nodes", "one process")  # the kinds that run the package's nodes
 PEERS = {"python": ("python",), "rclpy": ("compensator", "bridge")}  # the processes that take their place
 TICKS = os.sysconf("SC_CLK_TCK")
-
-
-class NodeLog:
-    """The log of all nodes as it grows; the launcher calls it with each line."""
-
-    def __init__(self) -> None:
-        self.lines: list[tuple[float, str]] = []  #: monotonic s
-
-    def __call__(self, node: str, line: str) -> None:
-        """Take one line of the log of `node`."""
-        self.lines.append((time.monotonic(), f"{node}: {line}"))
-
-    def matching(self, expression: str) -> list[tuple[float, str]]:
-        """Return the lines in which a regular expression is found, each with its time in monotonic s."""
-        return [(when, line) for when, line in self.lines if re.search(expression, line)]
+RATES = (
+    *(("one arm", ONE_ARM, rate) for rate in (200, 500, 1000)),
+    *(("both arms", BOTH_ARMS, rate) for rate in (200, 500)),
+    ("seven joints on CAN FD", SEVEN_JOINTS, 500),
+)
+QUICK_RATES = (RATES[1], RATES[3])
+KINDS = ("nodes", "one process", "python", "rclpy")
+OTHERS = {"python": "Python without ROS", "rclpy": "bare rclpy"}
+TURNS, SECONDS, QUICK_SECONDS = 3, 10.0, 5.0
 
 
 @dataclass(frozen=True)
@@ -81,11 +79,13 @@ def run_loop(kind: str, rate: float, file: str, seconds: float) -> LoopRun:
         arms = [DirectArm(params, namespace) for namespace in namespaces]
         recordings = [folder / f"{namespace.strip('/')}.npz" for namespace in namespaces]
         listeners = [
-            stack.enter_context(_listener(arm, recording)) for arm, recording in zip(arms, recordings, strict=True)
+            stack.enter_context(_process("bench.listener", arm.channel, str(arm.options["port"]), str(recording)))
+            for arm, recording in zip(arms, recordings, strict=True)
         ]
-        log = NodeLog()
+        log: list[tuple[float, str]] = []  # monotonic s, and a line of a node
         launched = params if kind in OURS else simulators
-        launcher = Launcher(launched, log, one_process=kind == "one process")
+        note = lambda node, line: log.append((time.monotonic(), f"{node}: {line}"))  # noqa: E731
+        launcher = Launcher(launched, note, one_process=kind == "one process")
         stack.callback(launcher.stop)
         begin = time.monotonic()
         launcher.start()
@@ -95,27 +95,29 @@ def run_loop(kind: str, rate: float, file: str, seconds: float) -> LoopRun:
             for part in PEERS.get(kind, ()):
                 peer = _process("bench.peers", part, str(params), namespace, str(rate))
                 pids[f"{namespace[1:]}/{part}"] = stack.enter_context(peer).pid
-        while len(log.matching(r"wearer: move \(0")) < len(namespaces):
+        while len(matching(log, r"wearer: move \(0")) < len(namespaces):
             time.sleep(0.05)
             if launcher.dead() or time.monotonic() > begin + START_LIMIT:
-                raise RuntimeError(f"the arm was not carried: {[line for _, line in log.lines[-10:]]}")
-        start = min(when for when, _ in log.matching(r": (INFO|WARN) active\b")) - begin if kind in OURS else math.nan
+                raise RuntimeError(f"the arm was not carried: {[line for _, line in log[-10:]]}")
+        start = min(when for when, _ in matching(log, r": (INFO|WARN) active\b")) - begin if kind in OURS else math.nan
         time.sleep(SETTLING)
         window, cpu = _measure(pids, seconds)
-        if (dead := launcher.dead()) or (let_down := log.matching("letting down")):
+        if (dead := launcher.dead()) or (let_down := matching(log, "letting down")):
             raise RuntimeError(f"the arm was not carried to the end: {dead[0] if dead else let_down[0][1]}")
         stack.close()
         if any(listener.wait() for listener in listeners):
             raise RuntimeError("the listener lost frames: the machine is too busy to measure anything")
-        timings = [_timing(arm, recording, window, rate) for arm, recording in zip(arms, recordings, strict=True)]
+        timings = []
+        for arm, recording in zip(arms, recordings, strict=True):
+            with np.load(recording) as frames:
+                cycles = split_cycles(dict(frames), arm.motors, *window)
+            timings.append(analyse(cycles, arm.motors, arm.law, 1.0 / rate))
         return LoopRun(timings, cpu, start)
 
 
-def _timing(arm: DirectArm, recording: Path, window: tuple[float, float], rate: float) -> LoopTiming:
-    """Return the timing of an arm between two times in s since 1970."""
-    with np.load(recording) as frames:
-        cycles = split_cycles(dict(frames), arm.motors, *window)
-    return analyse(cycles, arm.motors, arm.law, 1.0 / rate)
+def matching(log: list[tuple[float, str]], expression: str) -> list[tuple[float, str]]:
+    """Return the lines in which a regular expression is found."""
+    return [(when, line) for when, line in log if re.search(expression, line)]
 
 
 def write_parameters(folder: Path, rate: float, file: str, seconds: float) -> tuple[Path, Path]:
@@ -150,10 +152,6 @@ def _measure(pids: dict[str, int], seconds: float) -> tuple[tuple[float, float],
     return (begin, end), {name: (cpu_time(pid) - before[name]) / (end - begin) for name, pid in pids.items()}
 
 
-def _listener(arm: DirectArm, recording: Path) -> contextlib.AbstractContextManager[subprocess.Popen[bytes]]:
-    return _process("bench.listener", arm.channel, str(arm.options["port"]), str(recording))
-
-
 @contextlib.contextmanager
 def _process(module: str, *arguments: str) -> Iterator[subprocess.Popen[bytes]]:
     """Run a module in the context, and terminate it at the end."""
@@ -169,3 +167,91 @@ def cpu_time(pid: int) -> float:
     """Return the processor time in s that a process has used."""
     fields = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()
     return (int(fields[11]) + int(fields[12])) / TICKS
+
+
+# The rows
+
+Turn = dict[str, LoopRun]  # a run of each kind that carried the arm
+Figure = Callable[[LoopRun], float]
+Progress = Callable[[str], None]
+
+
+def measure_loops(quick: bool, progress: Progress) -> Iterator[Row]:
+    """Yield the rows of every rate, then of the start."""
+    starts: list[float] = []
+    for arms, file, rate in QUICK_RATES if quick else RATES:
+        name, turns = f"loop, {arms}, {rate} Hz", []
+        for number in range(1 if quick else TURNS):
+            progress(f"{name}, turn {number + 1}")
+            turns.append(run_turn(rate, file, QUICK_SECONDS if quick else SECONDS, progress))
+        yield from rows_of(name, rate, turns, "nodes")
+        yield from rows_of(f"{name}, one process", rate, turns, "one process")
+        starts += [turn["nodes"].start for turn in turns if "nodes" in turn]
+    if starts:
+        least = START_GATE.calm + GUIDANCE.time + GUIDANCE.watch
+        what = "start, launch to active: the checks and the begin of the torque"
+        yield Row.of_values(what, starts, [least] * len(starts), "s")
+
+
+def run_turn(rate: int, file: str, seconds: float, progress: Progress) -> Turn:
+    """Run every kind of loop once; one that does not carry the arm is left out."""
+    turn: Turn = {}
+    for kind in KINDS:
+        try:
+            turn[kind] = run_loop(kind, rate, file, seconds)
+        except RuntimeError as error:
+            progress(f"  {kind}: {error}")
+    return turn
+
+
+def rows_of(name: str, rate: int, turns: Sequence[Turn], kind: str) -> Iterator[Row]:
+    """Yield the table's rows of the loop `name` at `rate` (Hz): runs of `kind` next to those of its peers."""
+    allowed = 1.0 if rate == 1000 else 0.1  # % of the cycles
+    ran = [turn for turn in turns if kind in turn]
+    if not ran:
+        yield Row(f"{name}, missed (it did not run): limit", 100.0, allowed, "%")
+        return
+
+    def limited(what: str, figure: Figure, limit: float, unit: str) -> Row:
+        return Row.of_values(f"{name}, {what}", [figure(turn[kind]) for turn in ran], [limit] * len(ran), unit)
+
+    def compared(what: str, figure: Figure, unit: str, of: str, theirs: Figure | None = None) -> Iterator[Row]:
+        both = [turn for turn in ran if of in turn]
+        if both:
+            peer = [(theirs or figure)(turn[of]) for turn in both]
+            yield Row.of_values(f"{name}, {what}", [figure(turn[kind]) for turn in both], peer, unit)
+
+    peers = OTHERS | ({"nodes": "two processes"} if kind == "one process" else {})
+    for share in (50, 99, 99.9):
+        for of, peer in peers.items():
+            yield from compared(f"p{share:g}: {peer}", shared("latency", share), "ms", of)
+    yield limited("p99: one period", shared("latency", 99), 1e3 / rate, "ms")
+    for share in (99, 99.9):
+        yield limited(f"spacing p{share:g}: one period", shared("spacing", share), 1e3 / rate, "ms")
+    for what in ("missed", "late", "incomplete", "lost"):
+        yield limited(f"{what}: limit", percent(what), allowed, "%")
+        for of, peer in peers.items():
+            yield from compared(f"{what}: {peer}", percent(what), "%", of)
+    bridge = ("bridge", "compensator") if kind == "one process" else ("bridge",)
+    counterparts = {"can_bridge": bridge, "compensator": ("compensator",)}
+    for node in sorted({full_name.rpartition("/")[2] for full_name in ran[0][kind].cpu}):
+        if node in counterparts:
+            theirs = cpu(*counterparts[node])
+            yield from compared(f"CPU of {node}: bare rclpy", cpu(node), "%", "rclpy", theirs)
+        else:
+            yield limited(f"CPU of {node}: a core", cpu(node), 100.0, "%")
+
+
+def shared(what: str, share: float) -> Figure:
+    """Return the figure: the percentile of the latency or the spacing in ms over all arms."""
+    return lambda run: percentile(np.concatenate([getattr(arm, what) for arm in run.arms]), share) * 1e3
+
+
+def percent(what: str) -> Figure:
+    """Return the figure: the share of the cycles in percent that were `what`: missed, late, incomplete or lost."""
+    return lambda run: float(np.mean([100.0 * getattr(arm, what) / arm.cycles for arm in run.arms]))
+
+
+def cpu(*parts: str) -> Figure:
+    """Return the figure: percent of a core of the processes with these names, of one arm or two."""
+    return lambda run: 100.0 * sum(share for name, share in run.cpu.items() if name.rpartition("/")[2] in parts)

@@ -18,7 +18,7 @@ from exo_gravity.lab.bag.content import JOINT_STATE
 from exo_gravity.lab.bag.reader import read_bag
 from exo_gravity.lab.inputs.parameter_file import packaged_config
 
-from .table import Row, seconds_in_turns
+from .table import Row, race
 
 RATE, BEGIN = 500, 1_700_000_000  # Hz of the recordings, s since 1970
 FORMS = {
@@ -38,17 +38,13 @@ def measure_recordings(quick: bool) -> Iterator[Row]:
             peers: dict[str, Callable[[], object]] = {"rosbags": partial(_read_by_rosbags, bag)}
             if plugin is StoragePlugin.MCAP:
                 peers["mcap's own reader"] = partial(_read_by_mcap, bag)
-            size = _size(bag)
-            first, *others = seconds_in_turns((partial(read_bag, bag), *peers.values()), repeats)
+            with Reader(bag) as reader:
+                size = sum(len(data) for _, _, data in reader.messages()) / 1e6  # MB
+            calls: list[Callable[[], object]] = [partial(read_bag, bag), *peers.values()]
+            first, *others = race([(call, 1) for call in calls], repeats)
             for peer, taken in zip(peers, others, strict=True):
                 fast, other = ([size / spent for spent in column] for column in (first, taken))
                 yield Row.of_values(f"reading, {form}: {peer}", fast, other, "MB/s", more_is_better=True)
-
-
-def _size(bag: Path) -> float:
-    """Return the size of the messages of a recording in MB."""
-    with Reader(bag) as reader:
-        return sum(len(data) for _, _, data in reader.messages()) / 1e6
 
 
 def write_recording(

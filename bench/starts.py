@@ -8,7 +8,7 @@ from functools import partial
 from importlib.metadata import distribution
 from statistics import median
 
-from .table import Row, range_of, seconds_in_turns
+from .table import Row, race, range_of
 
 LIMIT = 0.3  # s
 TOOLS = "exo_gravity.tools."
@@ -19,12 +19,9 @@ def measure_starts(quick: bool) -> Iterator[Row]:
     """Yield a row for each tool."""
     scripts = distribution("exo_gravity").entry_points.select(group="console_scripts")
     tools = {script.name: script.module for script in scripts if script.module.startswith(TOOLS)}
-    calls = [partial(_help, module) for module in tools.values()]
+    programs = [[sys.executable, "-c", PROGRAM.format(module=module)] for module in tools.values()]
+    calls = [partial(subprocess.run, program, check=True, stdout=subprocess.DEVNULL) for program in programs]
     for call in calls:
         call()  # compiles what it imports
-    for name, seconds in zip(tools, seconds_in_turns(calls, 3 if quick else 5), strict=True):
+    for name, seconds in zip(tools, race([(call, 1) for call in calls], 3 if quick else 5), strict=True):
         yield Row(f"{name} --help: limit", median(seconds), LIMIT, "s", range_of(seconds))
-
-
-def _help(module: str) -> None:
-    subprocess.run([sys.executable, "-c", PROGRAM.format(module=module)], check=True, stdout=subprocess.DEVNULL)

@@ -55,11 +55,6 @@ def race(calls: Sequence[tuple[Callable[[], object], int]], blocks: int) -> list
     return times
 
 
-def seconds_in_turns(calls: Sequence[Callable[[], object]], repeats: int) -> list[list[float]]:
-    """Return how many s each call took, every time; they take turns."""
-    return race([(call, 1) for call in calls], repeats)
-
-
 def range_of(values: Sequence[float]) -> str:
     """Return the least and the largest value."""
     return f"{min(values):.3g} to {max(values):.3g}"

@@ -11,7 +11,7 @@ runs from its reply to its command.
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 
@@ -43,12 +43,12 @@ class LoopTiming:
     lost: int
 
 
+@dataclass(frozen=True)
 class Cycle:
     """Commands and replies from one command to the first motor until the next; by joint: (time, bytes)."""
 
-    def __init__(self) -> None:
-        self.commands: dict[int, tuple[float, bytes]] = {}
-        self.replies: dict[int, tuple[float, bytes]] = {}
+    commands: dict[int, tuple[float, bytes]] = field(default_factory=dict)
+    replies: dict[int, tuple[float, bytes]] = field(default_factory=dict)
 
 
 def split_cycles(frames: dict[str, np.ndarray], motors: Sequence[JointMotor], begin: float, end: float) -> list[Cycle]:

@@ -17,7 +17,7 @@ from rich.table import Table
 from exo_gravity.lab.parallel import in_processes
 
 from .arm import Result
-from .rows import Row, all_rows
+from .rows import Row, all_rows, played
 
 LONGEST = 1.0  # s without tilt
 
@@ -25,17 +25,6 @@ LONGEST = 1.0  # s without tilt
 def is_quiet(result: Result) -> bool:
     """Return whether nothing was raised without cause."""
     return not result.refused_starts and not result.let_downs and result.without_tilt < LONGEST
-
-
-def played(item: tuple[Row, float]) -> Result:
-    """Play a row for so many s."""
-    row, duration = item
-    return row.play(duration)
-
-
-def causes(result: Result) -> str:
-    """Return what was raised without cause."""
-    return "; ".join(result.refused_starts + result.let_downs) or "quiet"
 
 
 def main() -> int:
@@ -48,14 +37,13 @@ def main() -> int:
     console = Console(width=None if Console().is_terminal else 180, highlight=False)
     rows = [row for row in all_rows() if options.only in row.name]
     share = 60.0 * options.minutes / len(rows)
-    from bench.ordinary.__main__ import played as work  # other processes do not import the `__main__` of a package
-
     results: dict[Row, Result] = {}
-    for outcome in in_processes(work, [(row, share) for row in rows], options.workers):
+    for outcome in in_processes(played, [(row, share) for row in rows], options.workers):
         if outcome.result is None:
             raise RuntimeError(f"{outcome.item}: {outcome.problem}")
         results[outcome.item[0]] = outcome.result
-        console.print(f"{len(results)} of {len(rows)}: {outcome.item[0].name}: {causes(outcome.result)}", markup=False)
+        causes = "; ".join(outcome.result.refused_starts + outcome.result.let_downs) or "quiet"
+        console.print(f"{len(results)} of {len(rows)}: {outcome.item[0].name}: {causes}", markup=False)
     table = Table(
         "", "minutes", "starts", "refused", "let down", "rides", "samples %", "no tilt s", "error Nm", box=None
     )

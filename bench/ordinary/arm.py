@@ -1,10 +1,12 @@
 # Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
 """One arm with ordinary motors, sensors and computers, in virtual time: is it carried, and how well.
 
-What carries it is what the nodes use: the rig's loop, Compensator and TrunkEstimator. The simulated device gives the
+Motors have a current loop that lags, a velocity that is filtered, and noise in the torque of their replies. What
+carries the arm is what the nodes use: the rig's loop, Compensator and TrunkEstimator. The simulated device gives the
 truth.
 """
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from functools import partial
@@ -15,17 +17,18 @@ from exo_gravity.core.arm.rotation import ZERO
 from exo_gravity.core.arm.tilt import Tilt
 from exo_gravity.core.errors import ParameterError
 from exo_gravity.core.motors.ak import MIT_V3
+from exo_gravity.core.motors.joint_motor import JointMotor
 from exo_gravity.core.safety.drive import State
 from exo_gravity.hardware.trunk_estimator import ImuSample, TrunkEstimator
-from exo_gravity.sim import SimulatedDevice, SimulatedImu
+from exo_gravity.sim import SimulatedDevice, SimulatedImu, SimulatedMotor
+from exo_gravity.sim.motors import simulated
 from exo_gravity.sim.rig import START, Rig
 from exo_gravity.sim.trunk_motion import TrunkState
 from exo_gravity.sim.virtual_arm import TrunkReading
 from exo_gravity.sim.virtual_time import Wire
 
-from ..arms import Friction, PlayedArm, on_boards
+from ..arms import Friction, PlayedArm, of_family
 from .drivers import Timing
-from .motors import Electronics, motor_of
 
 TILT_TIMEOUT = 0.08  # s
 LOOK_PERIOD = 0.01  # s between two comparisons with the truth
@@ -48,6 +51,60 @@ def day_of(arm: PlayedArm) -> list[Mapping[str, object]]:
         {"move": rest, "over": 1.4},
         {"hold": 3.0},
     ]
+
+
+@dataclass(frozen=True)
+class Electronics:
+    """What an ordinary motor differs in from an ideal one."""
+
+    #: s, time constant of the current loop. A reply carries the torque that the motor applies when the command arrives.
+    current_lag: float
+    velocity_filter: float  #: s, time constant of the speed in replies and for damping
+    torque_noise: float = 0.0  #: Nm, standard deviation of the torque in one reply
+
+
+class OrdinaryMotor(SimulatedMotor):
+    """An ordinary motor. applied: Nm, that its current loop has reached."""
+
+    def __init__(self, joint: JointMotor, electronics: Electronics) -> None:
+        super().__init__(joint)
+        self.applied = 0.0
+        self._electronics = electronics
+        self._speed = 0.0  # rad/s, filtered
+
+    @property
+    def steady(self) -> bool:
+        """Whether the torque stays constant: not while the current loop follows."""
+        return False
+
+    def advance(self, position: float, velocity: float, dt: float) -> float:
+        """Let `dt` s pass, and return the torque in Nm; see `SimulatedMotor.advance`."""
+        if self.firmware.timeout:  # it counts the time since the last command
+            super().advance(position, velocity, dt)
+        self._speed -= (velocity - self._speed) * math.expm1(-dt / self._electronics.velocity_filter)
+        aim = super().torque(position, self._speed)
+        self.applied -= (aim - self.applied) * math.expm1(-dt / self._electronics.current_lag)
+        self.applied = self.applied if self.entered else 0.0
+        return self.applied
+
+    def torque(self, position: float, velocity: float) -> float:
+        """Return the torque in Nm that a reply shows."""
+        applied = self.applied if self.entered and not self.unplugged else 0.0
+        return applied + self._random.gauss(0.0, self._electronics.torque_noise)
+
+    def damps_at_once(self, torque: float) -> bool:
+        """Return False: the current loop follows."""
+        return False
+
+    def _state(self, position: float, velocity: float) -> bytes:
+        return super()._state(position, self._speed)
+
+
+def motor_of(joint: JointMotor, electronics: Electronics | None) -> SimulatedMotor:
+    """Return the motor of `joint`, an ideal one without `electronics`."""
+    if electronics is None:
+        return simulated(joint)
+    return of_family(OrdinaryMotor, joint.spec.family)(joint, electronics)
 
 
 @dataclass(frozen=True)
@@ -88,7 +145,9 @@ class OrdinaryArm(Rig):
         self, arm: PlayedArm, equipment: Equipment, is_v3: bool, rate: float, timing: Timing | None = None
     ) -> None:
         settings = replace(arm.carried.settings, tilt_timeout=TILT_TIMEOUT)
-        motors = on_boards(arm.motors, MIT_V3) if is_v3 else arm.motors
+        motors = arm.carried.motors
+        if is_v3:
+            motors = tuple(replace(each, spec=MIT_V3.ranged(each.spec), wire_format=MIT_V3) for each in motors)
         boards = [motor_of(joint, equipment.electronics) for joint in motors]
         device, wire = SimulatedDevice(arm.device_arm(equipment.friction), boards), Wire()
         super().__init__(device, settings, motors, arm.limits(rate), rate, wire, equipment.late / (0.01 * rate))

@@ -7,9 +7,8 @@ Then the other arms of config, which have no IMU, with the same motors, rates an
 from dataclasses import dataclass
 
 from ..arms import ARMS, Friction
-from .arm import Equipment, OrdinaryArm, Result
+from .arm import Electronics, Equipment, OrdinaryArm, Result
 from .drivers import ordinary_drivers
-from .motors import Electronics
 
 MARGIN = 120.0  # s; the last start may take that long
 CARRIED = 24.0  # s, of each start
@@ -73,3 +72,9 @@ def all_rows() -> list[Row]:
             is_v3 = ARMS[arm].has_v3 and turn % 2 == 1
             rows.append(Row(arm, equipment, is_v3, (V3_RATES if is_v3 else RATES)[(number + turn) % 3], ""))
     return rows
+
+
+def played(item: tuple[Row, float]) -> Result:
+    """Play a row for so many s."""
+    row, duration = item
+    return row.play(duration)

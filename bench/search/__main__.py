@@ -23,7 +23,7 @@ from rich.table import Table
 
 from ..arms import ARMS
 from .case import Event
-from .play import Played, play
+from .stage import Played, play
 
 SHOWN = 20
 AHEAD = 2  # cases that wait for each process
@@ -88,11 +88,10 @@ def search(arm: str, path: Path, minutes: float, workers: int, console: Console)
 
 def text_of(events: list[Any]) -> str:
     """Return the events of a case in one line."""
-    parts = []
-    for time_, name, values in events:
-        shown = " ".join(f"{key} {value}" for key, value in values.items())
-        parts.append(f"{time_:g} s: {name} {shown}".rstrip())
-    return "; ".join(parts)
+    return "; ".join(
+        " ".join((f"{time_:g} s: {name}", *(f"{key} {value}" for key, value in values.items())))
+        for time_, name, values in events
+    )
 
 
 def show(rows: dict[int, Row], console: Console) -> None:

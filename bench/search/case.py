@@ -107,16 +107,11 @@ def span(random: random.Random, shortest: float, longest: float) -> float:
     return round(math.exp(random.uniform(math.log(shortest), math.log(longest))), 3)
 
 
-def joints_of(arm: PlayedArm) -> range:
-    """Return the joints of an arm, from 0 on."""
-    return range(len(arm.motors))
-
-
 def some_motors(shortest: float, longest: float) -> Draw:
     """Draw one motor or all of them, and a duration in s."""
 
     def draw(random: random.Random, arm: PlayedArm) -> Values:
-        joints = joints_of(arm)
+        joints = range(len(arm.friction))
         motors = list(joints) if random.random() < 0.5 else [random.choice(joints)]
         return {"motors": motors, "duration": span(random, shortest, longest)}
 
@@ -125,21 +120,21 @@ def some_motors(shortest: float, longest: float) -> Draw:
 
 def slip(random: random.Random, arm: PlayedArm) -> Values:
     """Draw a joint and an error of its encoder in rad: a turn of the rotor, or 0.3 rad."""
-    joint = random.choice(joints_of(arm))
-    turn = 2.0 * math.pi / arm.motors[joint].spec.gear_ratio
+    joint = random.choice(range(len(arm.friction)))
+    turn = 2.0 * math.pi / arm.carried.motors[joint].spec.gear_ratio
     return {"joint": joint, "error": random.choice((-1.0, 1.0)) * random.choice((round(turn, 3), 0.3))}
 
 
 def wrong_speed(random: random.Random, arm: PlayedArm) -> Values:
     """Draw a joint, the factor of its reported speed, and a duration in s."""
     factor = random.choice((-1.0, 0.0, 0.3, 3.0))
-    return {"joint": random.choice(joints_of(arm)), "factor": factor, "duration": span(random, 0.1, 5.0)}
+    return {"joint": random.choice(range(len(arm.friction))), "factor": factor, "duration": span(random, 0.1, 5.0)}
 
 
 def on_joint(**choices: tuple[float, ...]) -> Draw:
     """Draw a joint, and one of the values of each name."""
     return lambda random, arm: {
-        "joint": random.choice(joints_of(arm)),
+        "joint": random.choice(range(len(arm.friction))),
         **{name: random.choice(values) for name, values in choices.items()},
     }
 
@@ -221,7 +216,8 @@ def draw(seed: int, name: str) -> Case:
     """Return the case of `seed` for the arm called `name`, always the same one."""
     source, arm = random.Random(seed), ARMS[name]
     worn = source.random() < 0.5 and arm.worn is not None
-    kinds = kinds_of(arm)
+    impossible = (*([] if arm.has_imu else NEEDS_IMU), *([] if arm.worn else NEEDS_WEARER))
+    kinds = [name for name in KINDS if name not in impossible]
     first, second = pair(source, kinds)
     begin = ENABLED if {first, second} & set(AT_POWER_UP) or source.random() < 0.25 else CARRIED
     longest = 8.0 if begin == ENABLED else 1.0
@@ -241,13 +237,6 @@ def draw(seed: int, name: str) -> Case:
     friction = source.choice((0.05, 0.2))
     to = pose(source, farthest, arm.nearest(farthest))
     return Case(name, seed, rate, worn, payload, friction, to, begin, in_order)
-
-
-def kinds_of(arm: PlayedArm) -> list[str]:
-    """Return the kinds of events that can happen to an arm."""
-    impossible = set() if arm.has_imu else set(NEEDS_IMU)
-    impossible |= set() if arm.worn else set(NEEDS_WEARER)
-    return [name for name in KINDS if name not in impossible]
 
 
 def pair(random: random.Random, kinds: list[str]) -> tuple[str, str]:
@@ -275,7 +264,10 @@ def bound_of(case: Case, clamped: bool) -> Bound:
             bounds.append(TILT_CREPT)
         if is_moved and tells_too_much(case, event):
             bounds.append(LOAD_LOST)
-        if event.name == "encoder_slip" and is_started_after(case, event):
+        # Who enables the arm after a slip vouches that it hangs as its angles say. If these are wrong by less than
+        # `home_tolerance`, the arm rises as one that is lighter than they say.
+        is_started = any(later.name in STARTS for later in case.events if later.time > event.time)
+        if event.name == "encoder_slip" and is_started:
             bounds.append(ASKED)
     bounds += [MOVED_UNREACHED] * is_moved_unreached(case)
     bounds += [TURNED_AHEAD] * is_turned_ahead(case, clamped)
@@ -290,15 +282,6 @@ def is_moved_after(case: Case, event: Event) -> bool:
     it as if a load of that mass had been lost, or into a pose in which the wrong tilt drives it.
     """
     return any(KINDS[later.name].group == "wearer" for later in case.events if later.time > event.time)
-
-
-def is_started_after(case: Case, event: Event) -> bool:
-    """Return whether the operator enables the arm after this event.
-
-    They vouch then that it hangs as its angles say. If these are wrong by less than `home_tolerance`, the arm rises as
-    one that is lighter than they say.
-    """
-    return any(later.name in STARTS for later in case.events if later.time > event.time)
 
 
 def is_turned_ahead(case: Case, clamped: bool) -> bool:

@@ -1,21 +1,26 @@
 # Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
-"""The arm of a case in virtual time, and what can happen to it beyond what exo_gravity/sim/events has."""
+"""The arm of a case in virtual time, what can happen to it beyond sim/events, and the judgement of its true motion."""
 
 from collections.abc import Mapping
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from functools import partial
 
 from exo_gravity.core.arm.interface import Payload
+from exo_gravity.core.safety.drive import State
 from exo_gravity.sim import SimulatedDevice
 from exo_gravity.sim.events import ACTS as SHARED
 from exo_gravity.sim.events import imu_wrong, payload_dropped
+from exo_gravity.sim.judge import Driven, driven
 from exo_gravity.sim.motors import simulated
-from exo_gravity.sim.rig import IMU_PERIOD, Act, Rig
+from exo_gravity.sim.rig import IMU_PERIOD, Act, Change, Rig
 
 from ..arms import ARMS, Friction
-from .case import BODY_MASS, CARRIED, Case
+from .case import BODY_MASS, CARRIED, Bound, Case, bound_of, draw
 
 TILT_TIMEOUT = 0.08  # s, that of a real arm
+MOVE, SETTLE = 1.6, 0.8  # s in which the wearer moves the arm to its pose, and then leaves it alone
+START = 30.0  # s within which an arm without a fault is carried
+AFTERWARDS, DESCENT = 5.0, 15.0  # s after the last event, and after the operator has disabled the arm then
 
 
 class Stage(Rig):
@@ -71,3 +76,57 @@ OWN: Mapping[str, Act] = {
     "trunk_falls": SHARED["bow"],
 }
 ACTS: Mapping[str, Act] = {**SHARED, **OWN}
+
+
+@dataclass(frozen=True)
+class Played:
+    """What became of a case."""
+
+    case: Case
+    driven: Driven
+    bound: Bound
+    states: tuple[Change, ...]
+    begin: float  #: s, from which the times of the events count
+    error: str = ""  #: an exception of the code under test
+
+    @property
+    def share(self) -> float:
+        """By how much the worst figure uses its bound up; above 1 it is beyond."""
+        speed = self.driven.speed / self.bound.speed
+        return 10.0 if self.error else max(speed, self.driven.energy / self.bound.energy)
+
+
+def play(seed: int, arm: str) -> Played:
+    """Return what becomes of the case of `seed` for the arm called `arm`."""
+    case = draw(seed, arm)
+    stage, begin, error = Stage(case), 0.0, ""
+    try:
+        begin = _play(stage, case)
+    except Exception as caught:
+        error = f"{type(caught).__name__}: {caught}"
+    stage.bus.close()
+    bound = bound_of(case, stage.direct.was_clamped)
+    config = stage.device.arm.config
+    stops = config.position_min, config.position_max
+    specs = [motor.joint.spec for motor in stage.motors]
+    done = driven(stage.truth.records, specs, stops, bound.slow, bound.turning)
+    return Played(case, done, bound, tuple(stage.changes), begin, error)
+
+
+def _play(stage: Stage, case: Case) -> float:
+    stage.run(0.2)
+    if case.begin == CARRIED:
+        stage.between_cycles(stage.safety.enable)
+        stage.run_until(lambda: stage.state is State.ACTIVE, START)
+        stage.raise_to(case.pose, MOVE, SETTLE)
+    begin = stage.now
+    stage.schedule(case.events, ACTS)
+    if case.begin != CARRIED:
+        stage.run(0.05)
+        stage.between_cycles(stage.safety.enable)
+    stage.run(case.events[-1].time + AFTERWARDS)
+    stage.let_down(DESCENT)
+    stage.run(1.0)
+    stage.catch_up()
+    stage.check_controller()
+    return begin

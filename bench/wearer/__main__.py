@@ -12,23 +12,13 @@ os.environ["OMP_NUM_THREADS"] = "1"
 
 import numpy as np
 
-from exo_gravity.core.errors import DataError
 from exo_gravity.core.numbers import COVER
 
 from ..device_study import Row, run_study
-from .devices import draw
-from .study import KINDS, Trial, play
+from .study import KINDS, Trial, judged
 
 COVERAGE = (0.92, 0.98)
 SHARE_ERROR = 0.05
-
-
-def judged(seed: int) -> Trial | str:
-    """Play and judge one wearer; return the sentence that says why there was no calibration."""
-    try:
-        return play(draw(seed))
-    except (DataError, RuntimeError) as error:
-        return str(error)
 
 
 def told(one: Trial | str) -> str:
@@ -74,6 +64,4 @@ def cover(trials: Sequence[Trial], kinds: Sequence[int]) -> float:
 
 
 if __name__ == "__main__":
-    from bench.wearer.__main__ import judged as work  # other processes do not import the `__main__` of a package
-
-    sys.exit(run_study("wearer", work, told, verdict))
+    sys.exit(run_study("wearer", judged, told, verdict))

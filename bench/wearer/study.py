@@ -6,28 +6,35 @@ while the support rises as much. Their trunk stands, bows and walks meanwhile. T
 through CAN frames and their 12 bits, and an IMU, once every 10 ms.
 """
 
+import bisect
+import itertools
 import math
-from collections.abc import Sequence
+import random
+from collections import deque
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from typing import Any, NamedTuple
 
 import numpy as np
 
 from exo_gravity.core.arm.interface import STANDARD_GRAVITY
+from exo_gravity.core.arm.paper import ArmModel
 from exo_gravity.core.arm.tilt import Tilt, gravity_in_trunk, turning_in_base
 from exo_gravity.core.compensation.compensator import JOINTS, Compensation, Compensator
 from exo_gravity.core.compensation.settings import Settings
+from exo_gravity.core.errors import DataError
+from exo_gravity.core.numbers import NO_TORQUE, Torque
 from exo_gravity.core.safety.limits import Limits
 from exo_gravity.lab.observer.share import Share, WearerCurve, observed, share_of
 from exo_gravity.lab.trial.offline import ArmSetup, OfflineTrial
-from exo_gravity.sim import SimulatedImu
+from exo_gravity.sim import STEP, SimulatedImu, VirtualWearer
 from exo_gravity.sim.imu import ImuConfig
 from exo_gravity.sim.script import TrialScript
 from exo_gravity.sim.trunk_motion import TrunkState
 from exo_gravity.sim.virtual_arm import TrunkReading
+from exo_gravity.sim.virtual_wearer import path_between
 
-from .devices import Worn, turned
-from .muscles import Muscles, Phase, phase_at
+from .devices import Worn, draw, turned
 
 RATE = 100.0  # Hz, of the control loop and the IMU
 DELAY = 2.0  # s until the wearer begins
@@ -40,6 +47,97 @@ TRUNK: tuple[dict[str, Any], ...] = (
 TILT_NOISE = math.radians(0.6)  # of the filter, as core/trunk/uncertainty.py has it; it stays for about
 TILT_TIME = 3.0  # s
 KINDS = ("reach", "hold", "rest", "trunk in motion")
+STIFFNESS, DAMPING, INTEGRAL = (15.0, 25.0, 20.0, 8.0), (1.0, 2.0, 1.5, 0.5), (15.0, 25.0, 20.0, 8.0)
+MUSCLE_DELAY = 0.05  # s from command to muscle
+ACTIVATION = 0.04  # s, time constant
+NOISE = 0.03  # of the torque,
+NOISE_TIME = 0.05  # s, low-passed
+STRENGTH = 30.0  # Nm
+
+
+class Phase(NamedTuple):
+    """A pose that is reached in `move` s and held for `hold` s.
+
+    lifted: the shares of their arm that the wearer lifts at the start and the end. rests: they let go while it is held.
+    """
+
+    pose: tuple[float, ...]
+    move: float
+    hold: float
+    lifted: tuple[float, float]
+    rests: bool = False
+
+
+class Muscles(VirtualWearer):
+    """Goes through `phases`, whatever the trunk's `script` does meanwhile.
+
+    Their torque is the sum of an impedance about the path that they mean to follow, which muscles and reflexes give at
+    once, and of what they command: a share of their arm's weight, plus a slow correction. Commands come MUSCLE_DELAY
+    late and through ACTIVATION, with noise in proportion to the torque (signal-dependent noise, Harris and Wolpert
+    1998).
+
+    arm: the wearer's own. tilt: called for the trunk's true tilt. log: s, torque (4,) Nm and weight (4,) Nm at every
+    step.
+    """
+
+    def __init__(
+        self, script: TrialScript, phases: Sequence[Phase], arm: ArmModel, tilt: Callable[[], Tilt], seed: int
+    ) -> None:
+        super().__init__(script, STRENGTH)
+        self.phases, self._arm, self._tilt = phases, arm, tilt
+        self.log: list[tuple[float, Torque, Torque]] = []
+        self._random = random.Random(seed)
+        self._late: deque[list[float]] = deque([[0.0] * 4] * round(MUSCLE_DELAY / STEP))
+        self._active, self._noise, self._sum = [0.0] * 4, [0.0] * 4, [0.0] * 4
+        self._from: Sequence[float] = NO_TORQUE
+        self._index, self._end = -1, sum(phase.move + phase.hold for phase in phases)
+
+    def idle(self, elapsed: float, duration: float) -> bool:
+        """Return False: the muscles always have a torque."""
+        return False
+
+    def torque(self, elapsed: float, theta: Sequence[float], velocity: Sequence[float]) -> Torque:
+        """Return the wearer's torque (4,) in Nm."""
+        super().torque(elapsed, theta, velocity)  # follows the script's steps
+        if elapsed < 0.0:
+            self._from = tuple(theta)
+        if not 0.0 <= elapsed < self._end:
+            return NO_TORQUE
+        index, since = phase_at(self.phases, elapsed)
+        if index != self._index:
+            self._from = self.phases[self._index].pose if index else self._from
+            if index and self.phases[self._index].rests:
+                self._from = tuple(theta)
+            self._index = index
+        phase = self.phases[index]
+        held = min(1.0, max(0.0, since - phase.move - 0.3) / 0.5) if phase.rests else 0.0  # lets go
+        lifted = phase.lifted[0] + (phase.lifted[1] - phase.lifted[0]) * min(1.0, since / (phase.move + phase.hold))
+        weight = self._arm.torque(theta, self._tilt())
+        path = path_between(self._from, phase.pose, since, phase.move)
+        wanted, given = [], []
+        for n, (position, speed) in enumerate(path):
+            error = position - theta[n]
+            total = (1.0 - held) * (self._sum[n] + INTEGRAL[n] * error * STEP)
+            self._sum[n] = max(-STRENGTH, min(STRENGTH, total))
+            wanted.append((1.0 - held) * (lifted * weight[n] + self._sum[n]))
+            at_once = (1.0 - held) * STIFFNESS[n] * error
+            self._active[n] += STEP / ACTIVATION * (self._late[0][n] - self._active[n])
+            step = STEP / NOISE_TIME
+            self._noise[n] += -step * self._noise[n] + math.sqrt(2.0 * step) * self._random.gauss(0.0, 1.0)
+            whole = at_once + self._active[n] * (1.0 + NOISE * self._noise[n])
+            yielding = (1.0 - held) * DAMPING[n] * (speed - velocity[n])  # also beyond their strength
+            given.append(max(-STRENGTH, min(STRENGTH, whole)) + yielding)
+        self._late.popleft()
+        self._late.append(wanted)
+        self.log.append((elapsed, tuple(given), weight))
+        return tuple(given)
+
+
+def phase_at(phases: Sequence[Phase], elapsed: float) -> tuple[int, float]:
+    """Return the index of the phase at `elapsed` s, the last one after the end, and the time since it began."""
+    ends = list(itertools.accumulate(phase.move + phase.hold for phase in phases))
+    index = min(bisect.bisect_right(ends, elapsed), len(phases) - 1)
+    return index, elapsed - (ends[index - 1] if index else 0.0)
 
 
 class Trial(NamedTuple):
@@ -175,3 +273,11 @@ def _trunk_moves(elapsed: np.ndarray) -> np.ndarray:
 def only(curve: WearerCurve, keep: np.ndarray) -> WearerCurve:
     """Return the part of a curve where `keep` (n,) is true."""
     return WearerCurve(*(part[keep] for part in curve))
+
+
+def judged(seed: int) -> Trial | str:
+    """Play and judge one wearer; return the sentence that says why there was no calibration."""
+    try:
+        return play(draw(seed))
+    except (DataError, RuntimeError) as error:
+        return str(error)
