@@ -83,9 +83,8 @@ def run_loop(kind: str, rate: float, file: str, seconds: float) -> LoopRun:
             for arm, recording in zip(arms, recordings, strict=True)
         ]
         log: list[tuple[float, str]] = []  # monotonic s, and a line of a node
-        launched = params if kind in OURS else simulators
         note = lambda node, line: log.append((time.monotonic(), f"{node}: {line}"))  # noqa: E731
-        launcher = Launcher(launched, note, one_process=kind == "one process")
+        launcher = Launcher(params if kind in OURS else simulators, note, one_process=kind == "one process")
         stack.callback(launcher.stop)
         begin = time.monotonic()
         launcher.start()
@@ -95,11 +94,14 @@ def run_loop(kind: str, rate: float, file: str, seconds: float) -> LoopRun:
             for part in PEERS.get(kind, ()):
                 peer = _process("bench.peers", part, str(params), namespace, str(rate))
                 pids[f"{namespace[1:]}/{part}"] = stack.enter_context(peer).pid
-        while len(matching(log, r"wearer: move \(0")) < len(namespaces):
+        carried = r": (INFO|WARN) active\b"
+        while len(matching(log, r"wearer: move \(0")) < len(namespaces) or (
+            kind in OURS and not matching(log, carried)
+        ):
             time.sleep(0.05)
             if launcher.dead() or time.monotonic() > begin + START_LIMIT:
                 raise RuntimeError(f"the arm was not carried: {[line for _, line in log[-10:]]}")
-        start = min(when for when, _ in matching(log, r": (INFO|WARN) active\b")) - begin if kind in OURS else math.nan
+        start = min(when for when, _ in matching(log, carried)) - begin if kind in OURS else math.nan
         time.sleep(SETTLING)
         window, cpu = _measure(pids, seconds)
         if (dead := launcher.dead()) or (let_down := matching(log, "letting down")):

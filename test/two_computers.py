@@ -41,7 +41,6 @@ PARTS = {
     "robot": ("/imu", "/right/can_bridge", "/right/simulator", "/robot/recorder"),
 }
 POSE, MOVE, HOLD = [0.1, 0.8, 0.7, 0.6], 2.0, 8.0  # rad, s, s
-START_TIMEOUT = 40.0  # s
 # As config/sim.yaml, for a busy computer, but efforts may be no older than on a real arm.
 TIMING = {**SIMULATED, "can_bridge": {**SIMULATED["can_bridge"], "command_timeout": 0.05}}
 HOLDER = ("sh", "-c", "echo ready; read _")  # ends with its standard input, and with it the namespace
@@ -157,7 +156,7 @@ def play(case: Case, folder: Path) -> tuple[str, list[str]]:
     nodes.add("/robot/recorder", output=str(folder / "bag"), live=True)
     line: dict[str, Any] = {}
     log, bridge, action, traffic, ages = "", dict[str, str](), "", list[float](), list[float]()
-    end = time.time() + START_TIMEOUT + MOVE + HOLD
+    end = time.time() + 40.0 + MOVE + HOLD
     with network(case, traffic) as start, (folder / "desk.txt").open("w") as desk:
         command = (executable("launcher"), "--params", str(nodes.path), "--only")
         other = start("desk", *command, *PARTS["desk"], out=desk, ROS_STATIC_PEERS=ADDRESSES["robot"])

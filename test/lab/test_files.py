@@ -76,8 +76,6 @@ THEN = DATA / "a47959f4"
 
 TABLES = {"can_bridge": CAN_BRIDGE, "imu": IMU, "simulator": SIMULATOR}
 
-SHORT = TrialScript.parse({"name": "short", "steps": [{"move": [0.1, 0.6, 1.2, 0.5], "over": 2.0}, {"hold": 2.0}]})
-
 
 def test_a_script_bends_the_elbow_and_one_for_another_number_of_joints_or_a_tool_for_another_arm_is_refused() -> None:
     (trial,) = simulated_trials(packaged_config("elbow.yaml"), read_script("elbow")[1])
@@ -110,7 +108,7 @@ def test_every_node_takes_its_parameters_and_every_arm_is_made_of_them(file: str
 
 @pytest.mark.parametrize("file", quick(["sim"], ["sim", "sim_both"]))
 def test_every_simulated_arm_is_carried_through_a_trial(file: str) -> None:
-    for trial in simulated_trials(THEN / f"{file}.yaml", SHORT):
+    for trial in simulated_trials(THEN / f"{file}.yaml", script_to([0.1, 0.6, 1.2, 0.5])):
         recording = trial.run()
         assert trial.trouble == "" and recording.carried
     assert TrialScript.parse(yaml.safe_load((THEN / "home.yaml").read_text(encoding="utf-8"))).steps

@@ -314,8 +314,6 @@ def test_friction_that_grows_with_the_torque_is_not_taken_for_the_wearers():
 
 REST, BLOW = [0.0] * 50, [4.0] * 10  # Nm, 100 times a second
 
-GROWING = [4.0 * math.sin(0.5 * math.pi * min(1.0, n / 150)) for n in range(300)]
-
 
 def touched(torques: list[float], deviation: float = 0.2, gap: float = 0.0) -> ContactWatch:
     """Return the watch after these torques of the elbow in Nm. gap: s before the last one."""
@@ -332,7 +330,7 @@ def touched(torques: list[float], deviation: float = 0.2, gap: float = 0.0) -> C
     [
         ([*REST, *[-4.0] * 100], 0.2, 0.0, 1),
         ([*REST, *BLOW, *[0.0] * 250, *REST, *BLOW], 0.2, 0.0, 2),
-        (GROWING, 0.2, 0.0, 0),
+        ([4.0 * math.sin(0.5 * math.pi * min(1.0, n / 150)) for n in range(300)], 0.2, 0.0, 0),
         ([*REST, *BLOW], 3.0, 0.0, 0),
         ([*REST, 9.0], 0.1, 10.0, 0),
     ],

@@ -30,10 +30,9 @@ STILL = (0.0,) * 4
 RATE = 100.0  # Hz
 MOVE = 4.0  # s in which the hand leads the arm to POSE
 LOAD = Wearer(70.0).on_links(DEFAULT_LINKS.length)
-CALIBRATED = ModelError((0.05,) * 4, (0.01,) * 4, 0.02, 0.01)
 SETTINGS = Settings(
     "right", DEFAULT_LINKS, mode="zero_g", support=1.0, wearer_mass=tuple(LOAD.mass), wearer_cog=tuple(LOAD.cog),
-    use_imu=False, max_effort=(9.0, 18.0, 9.0, 9.0), model_error=CALIBRATED,
+    use_imu=False, max_effort=(9.0, 18.0, 9.0, 9.0), model_error=ModelError((0.05,) * 4, (0.01,) * 4, 0.02, 0.01),
 )  # fmt: skip
 TILT = Tilt.of("right")
 

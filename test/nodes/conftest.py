@@ -10,7 +10,7 @@ from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
 
 from ..support.launched_nodes import LaunchedNodes
-from ..support.node_thread import own_node
+from ..support.node_thread import Served, own_node
 from ..support.ros_probe import RosProbe
 
 
@@ -26,6 +26,15 @@ def executor() -> Iterator[SingleThreadedExecutor]:
     """The executor of one node in the namespace /right, which the tests of a module share."""
     with own_node("spinning") as (_, executor):
         yield executor
+
+
+@pytest.fixture
+def served() -> Iterator[Served]:
+    """A lifecycle node and a client; `spin` handles what has arrived for either."""
+    with own_node("asking") as own:
+        served = Served(*own)
+        yield served
+        served.close()
 
 
 @pytest.fixture

@@ -23,7 +23,6 @@ from ..support.ros_probe import RosProbe
 from ..support.truth import Truth
 from ..support.waiting import wait_until
 
-PACKAGE = ("exo_gravity", "exo.launch.py")
 ANSWER_TIMEOUT = 60.0  # s for a command's output
 STOP_TIMEOUT = 60.0  # s
 LARGEST_SPEED = 1.0  # rad/s of an arm that is let down
@@ -35,7 +34,13 @@ class Launched:
     def __init__(self, nodes: LaunchedNodes, *arguments: str, file: Path | None = None) -> None:
         self.truth = Truth(nodes.truth_path())
         self.log: list[str] = []
-        command = ["ros2", "launch", *([file] if file else PACKAGE), f"params:={nodes.path}", *arguments]
+        command = [
+            "ros2",
+            "launch",
+            *([file] if file else ("exo_gravity", "exo.launch.py")),
+            f"params:={nodes.path}",
+            *arguments,
+        ]
         self.process = subprocess.Popen(
             command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, start_new_session=True
         )

@@ -60,7 +60,6 @@ from exo_gravity.sim import ArmConfig
 
 from ..hardware.arms import NoWatchdog, SimulatedRig, raised_arm
 from ..support.keys import broken
-from ..support.node_thread import Served, own_node
 from ..support.simulated_device import make_device
 from ..support.waiting import wait_until
 
@@ -282,15 +281,6 @@ def test_simulated_time_is_refused_with_a_real_bus_at_the_start_and_live(node):
 
 
 # Requests over DDS, and what waits for the control thread
-
-
-@pytest.fixture
-def served():
-    """A bridge's node and a client; `spin` handles what has arrived for either."""
-    with own_node("asking") as own:
-        served = Served(*own)
-        yield served
-        served.close()
 
 
 @pytest.mark.parametrize("data", [True, False])

@@ -543,7 +543,6 @@ def test_efforts_for_an_effort_controller_are_refused_in_one_process(called):
 
 LOAD = Wearer(75.0).on_links(ROBOT.length)
 NEEDED = gravity_torque(ROBOT.with_wearer(LOAD.mass, LOAD.cog), POSE)
-CARRIED = gravity_torque(ROBOT.with_wearer(LOAD.mass, LOAD.cog, 0.4), POSE)
 GIVEN = np.array((0.0, 4.0, 1.5, 0.0))  # Nm, of the wearer
 WEIGHT = NEEDED - gravity_torque(ROBOT, POSE)  # Nm, that carries the wearer's arm
 NONE = ["0.0"] * len(PARTS)  # Nm
@@ -663,7 +662,8 @@ def test_the_wearers_torque_on_an_arm_of_three_joints_is_known_once_its_urdf_arr
 @pytest.mark.thorough
 def test_the_support_follows_an_arm_that_sinks_and_returns_when_the_node_ends_while_the_arm_is_carried_on(make_rig):
     rig = make_rig("/right", ADAPTIVE, NAMES, POSE)
-    rig.effort, sinking = CARRIED.tolist(), [0.0]  # rad in each cycle, of the second joint
+    rig.effort = gravity_torque(ROBOT.with_wearer(LOAD.mass, LOAD.cog, 0.4), POSE).tolist()
+    sinking = [0.0]  # rad in each cycle, of the second joint
 
     def sink(_stamp: object) -> None:
         rig.pose[1] -= sinking[0]

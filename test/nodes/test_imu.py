@@ -35,7 +35,6 @@ MOUNTING = tuple(TRUNK_FROM_IMU.as_quat().tolist())
 MOUNTED = f"rotation_trunk_from_imu:={list(MOUNTING)}"
 LEVEL = "rotation_trunk_from_imu:=[0.0, 0.0, 0.0, 1.0]"
 AHEAD = 25  # samples in flight: fewer than the node queues, so that none is lost
-ERROR = DiagnosticStatus.ERROR
 
 
 class ImuRig(NodeRig):
@@ -68,7 +67,7 @@ class ImuRig(NodeRig):
     def values(self) -> Mapping[str, str]:
         return self.values_of("imu")
 
-    def reports(self, text: str, level: bytes = ERROR, since: int = 0) -> bool:
+    def reports(self, text: str, level: bytes = DiagnosticStatus.ERROR, since: int = 0) -> bool:
         return any(text in one.message and one.level == level for one in self.reported[since:])
 
     def send(self, stamp, rate=(0.0, 0.0, 0.0), acceleration=(0.0, 0.0, G), orientation=None, noise=1e-9, covariance=0):

@@ -60,7 +60,7 @@ from exo_gravity.nodes.ros.run import handle_signals
 from exo_gravity.nodes.ros.subscriptions import NEWEST_ONLY, PolledSubscription, Publishers
 
 from ..support import CONFIG
-from ..support.node_thread import NodeThread, Served, own_node
+from ..support.node_thread import NodeThread, own_node
 from ..support.waiting import pause, wait_until
 
 keep_to_this_machine()
@@ -199,9 +199,11 @@ def test_a_node_that_has_gone_and_returned_is_read_anew(executor):
 
 UNKNOWN_TYPE = ParameterMessage(name="some", value=ParameterValue(type=99))
 TEXTS = ["", "msispelt", "support", "can.channel", "use_sim_time", "a b", "/x", "." * 300, "é"]
-VALUES = [math.nan, math.inf, -1e308]
 ODD = [
-    ParameterMessage(name=name, value=ParameterValue(type=kind, double_value=math.nan, double_array_value=VALUES))
+    ParameterMessage(
+        name=name,
+        value=ParameterValue(type=kind, double_value=math.nan, double_array_value=[math.nan, math.inf, -1e308]),
+    )
     for name, kind in zip(TEXTS * 2, (*range(10), 99, 255), strict=False)
 ]
 WRONG_REQUESTS = (
@@ -219,15 +221,6 @@ WRONG_REQUESTS = (
     (ChangeState, "change_state", ChangeState.Request(transition=Transition(id=200))),
     (ChangeState, "change_state", ChangeState.Request(transition=Transition(label="fly"))),
 )
-
-
-@pytest.fixture
-def served():
-    """A node that nothing spins."""
-    with own_node("asking") as own:
-        served = Served(*own)
-        yield served
-        served.close()
 
 
 def test_wrong_requests_to_the_standard_services_are_answered_and_end_no_node(served):
@@ -337,14 +330,13 @@ def test_a_person_at_a_terminal_is_asked_once_for_each_question_and_their_yes_re
 
 RANGE, ROS_RANGE = "EXO_GRAVITY_DISCOVERY_RANGE", "ROS_AUTOMATIC_DISCOVERY_RANGE"
 PEERS, PROFILES = "ROS_STATIC_PEERS", "FASTRTPS_DEFAULT_PROFILES_FILE"
-VARIABLES = (RANGE, ROS_RANGE, PEERS, PROFILES, "ROS_LOCALHOST_ONLY", "ROS_DISCOVERY_SERVER")
 LOOPBACK, WITH_PEERS = (str(Path(network.__file__).with_name(name)) for name in ("fastdds.xml", "fastdds_peers.xml"))
 SECURITY = {"ROS_SECURITY_ENABLE": "true", "ROS_SECURITY_STRATEGY": "Enforce"}
 
 
 @pytest.fixture
 def environment(monkeypatch):
-    for name in (*VARIABLES, *SECURITY):
+    for name in (RANGE, ROS_RANGE, PEERS, PROFILES, "ROS_LOCALHOST_ONLY", "ROS_DISCOVERY_SERVER", *SECURITY):
         monkeypatch.setenv(name, "")  # so that what the test's subject sets goes after the test
         monkeypatch.delenv(name)
     return monkeypatch.setenv

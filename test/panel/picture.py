@@ -10,9 +10,6 @@ from ..support import ROOT
 from ..support.panel_browser import chromium, open_page, wait_for_state
 from ..support.panel_stage import Stage
 
-DOCS = ROOT / "docs"
-RECORDING = {"on": True, "foreign": False, "folder": "recordings/P01/2026-03-14/recording", "seconds": 84}
-
 
 def main() -> None:
     stage = Stage()
@@ -21,7 +18,12 @@ def main() -> None:
     for settings in stage.arms.settings.values():
         settings["mode"] = "zero_g"
     stage.arms.wearer |= {"share of the wearer (%)": "40", "share band (%)": "10"}
-    stage.files.content["recording"] = RECORDING
+    stage.files.content["recording"] = {
+        "on": True,
+        "foreign": False,
+        "folder": "recordings/P01/2026-03-14/recording",
+        "seconds": 84,
+    }
     try:
         with chromium() as browser:
             _shoot(browser, stage, "panel", 1280, 800)
@@ -43,7 +45,7 @@ def _shoot(browser: Browser, stage: Stage, name: str, width: int, height: int) -
         page.click("#take")
         page.wait_for_selector("#release:visible")
         page.evaluate("scrollTo(0, 0)")
-    page.screenshot(path=DOCS / f"{name}.png")
+    page.screenshot(path=ROOT / "docs" / f"{name}.png")
     page.context.close()
 
 

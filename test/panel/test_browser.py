@@ -112,12 +112,9 @@ def test_a_start_asks_whether_the_arm_hangs_as_it_is_drawn(page, stage):
 
 # 2. Let down
 
-# What has the focus as the space bar is pressed; '' for a press with the mouse.
-MEANS = ("", "body", "input[name=body_mass]", of_arm(".down"), "#session [name=note]")
-
 
 def test_one_press_lets_both_arms_down(page, stage):
-    for focus in MEANS:
+    for focus in ("", "body", "input[name=body_mass]", of_arm(".down"), "#session [name=note]"):
         stage.arms.states = dict.fromkeys(BOTH_ACTIVE, "disabled")
         page.wait_for_selector("#session [name=note]:enabled")
         if "note" in focus:  # it takes no space from now on
@@ -168,7 +165,6 @@ def test_one_arm_alone_can_be_let_down_and_what_is_not_confirmed_is_an_alarm(pag
 ELBOW, ABDUCTION = "right_elbow_flexion", "right_shoulder_abduction"
 FINE = {"longest stall (ms)": "3", "longest silence (ms)": "14", "disconnected": "no"}
 BUSY = {**FINE, "longest silence (ms)": "212"}
-CUT_OFF = "Hold the arm and press the emergency stop."
 ASTRAY = {"joints outside limits": ELBOW, "turn back (deg)": "-0.1"}
 OUTSIDE = {"reports": {"right": {"waiting for": "joint_limits", **ASTRAY}}}
 STAYED = "The motors stayed off."
@@ -194,7 +190,7 @@ TOLD: list[tuple[str, dict[str, Any], tuple[str, ...], str]] = [
     ("motor_silent", {"simulator": {**BUSY, "disconnected": "yes"}}, ("CAN cable",), "busy"),
     ("motor_silent", {"simulator": None}, ("The simulator does not report",), "busy"),
     ("wrong_sign", {}, ("Call the engineer",), "Then press"),
-    ("wrong_sign", {"reports": UNREACHED}, ("A motor may still be powered.", CUT_OFF), "Then"),
+    ("wrong_sign", {"reports": UNREACHED}, ("A motor may still be powered.", "press the emergency stop."), "Then"),
     ("command_stale", {}, ("Then press Carry again.",), "engineer"),
     (
         "command_withdrawn", {"compensator": {"state": "withdrawn", "reason": "late_tilt"}},
@@ -509,9 +505,7 @@ TALLEST = """async (column) => {
     const codes = Object.keys(texts).filter((key) => key.startsWith("fault.")).map((key) => key.slice(6));
     return Math.max(...codes.map(height));
 }"""
-LONG = {"on": True, "foreign": False, "folder": f"/home/clinic/recordings/{'P' * 60}", "seconds": 3600}
 SIZES = {"phone": (390, 844), "tablet": (768, 1024), "200 %": (640, 450), "desk": (1280, 800)}  # 200 % of 1280 by 900
-STEADY = tuple(map(of_arm, (".down", ".support input", ".weigh")))
 
 
 @pytest.mark.parametrize(("width", "height"), SIZES.values(), ids=SIZES)
@@ -527,11 +521,16 @@ def test_on_every_screen_let_down_stays_in_sight_nothing_is_cut_off_and_no_state
         stage.arms.states = dict.fromkeys(BOTH_ACTIVE, state)
         for arm in BOTH_ACTIVE:
             wait_for_state(page, state, arm)
-        seen.add(tuple(places(page, *STEADY)))
+        seen.add(tuple(places(page, *map(of_arm, (".down", ".support input", ".weigh")))))
     assert len(seen) == 1
     stage.arms.states["right"] = "ramping in"  # the longest name of a state
     stage.arms.fail("left", "implausible_zero")
-    stage.files.content["recording"] = LONG
+    stage.files.content["recording"] = {
+        "on": True,
+        "foreign": False,
+        "folder": f"/home/clinic/recordings/{'P' * 60}",
+        "seconds": 3600,
+    }
     page.wait_for_selector("#light:visible")
     for position in ("0", "document.body.scrollHeight / 2", "document.body.scrollHeight"):
         page.evaluate(f"scrollTo(0, {position})")
@@ -549,16 +548,18 @@ def test_on_every_screen_let_down_stays_in_sight_nothing_is_cut_off_and_no_state
         assert page.evaluate(TALLEST, column) == 0.0  # no text of a fault is longer than its place
 
 
-# What a training needs, on one screen of one arm.
-TRAINING = (".lead .badge", ".tell", ".enable", ".modes", ".support input", ".carries")
-
-
 def test_at_1280_by_800_a_training_is_on_one_screen_and_on_a_phone_the_remedy_comes_before_who_operates(visit, stage):
     stage.arms.names = ("right",)
     del stage.arms.settings["left"]
     page = visit(width=1280, height=800, folded=True)
     page.wait_for_selector("#plots figure >> nth=1")
-    needed = [*map(of_arm, TRAINING), "#control", "#picture", "#plots figure >> nth=0", "#plots figure >> nth=1"]
+    needed = [
+        *map(of_arm, (".lead .badge", ".tell", ".enable", ".modes", ".support input", ".carries")),
+        "#control",
+        "#picture",
+        "#plots figure >> nth=0",
+        "#plots figure >> nth=1",
+    ]
     boxes = [page.locator(part).bounding_box() for part in needed]
     assert max(box["y"] + box["height"] for box in boxes) <= page.locator("footer").bounding_box()["y"]
     assert boxes[-3]["width"] >= 600  # the picture: three views side by side

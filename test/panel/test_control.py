@@ -228,7 +228,6 @@ folder.mkdir(parents=True)
 for line in ({"folder": str(folder)}, {"step": 0, "left": 4.0}, LAST, {"problem": PROBLEM}):
     print(json.dumps(line), flush=True)
 """
-CANNOT_START = "import sys; print('trial: no rclpy', file=sys.stderr); raise SystemExit(2)"
 
 
 COMPENSATOR = {"mode": "one_g", "robot.mass": [0.5] * 4, "anfis": [], **WEARER_FILE}
@@ -315,11 +314,9 @@ def test_a_recorder_that_has_ended_by_itself_is_stopped_with_its_exit_code(kept,
     assert "exit code 1" in asyncio.run(stopped())
 
 
-# What the trial prints last and its problem, and its end as the page shows it.
-TRIALS = [("{'phase': 'reporting'}", ""), ("{'step': 0, 'left': 3.0}", "stopped by the operator")]
-
-
-@pytest.mark.parametrize(("last", "problem"), TRIALS)
+@pytest.mark.parametrize(
+    ("last", "problem"), [("{'phase': 'reporting'}", ""), ("{'step': 0, 'left': 3.0}", "stopped by the operator")]
+)
 def test_a_trial_of_a_subject_is_followed_to_its_report_and_listed_also_after_a_restart(
     kept, run_instead, tmp_path, last, problem
 ):
@@ -345,7 +342,7 @@ def test_a_trial_of_a_subject_is_followed_to_its_report_and_listed_also_after_a_
 
 
 def test_a_trial_that_cannot_start_says_why(kept, run_instead):
-    run_instead(CANNOT_START)
+    run_instead("import sys; print('trial: no rclpy', file=sys.stderr); raise SystemExit(2)")
     assert kept.followed()[-1]["trial"]["problem"] == "trial: no rclpy"
     kept.device.states.return_value = {"right": "disabled"}
     assert "every arm is active" in asyncio.run(kept.trial("short"))
@@ -442,15 +439,11 @@ def test_a_change_of_which_the_panel_learns_after_the_fault_is_the_cause_and_a_l
     assert look.go(0.1, RAISED) == cause
 
 
-# The bridge's limits, the compensator's, and what the page shows.
-LIMITED = [
-    ([3.0, 9.0, 3.0, 3.0], [0.0, 5.0, 0.0, 12.0], [3.0, 5.0, 3.0, 3.0]),
-    ([3.0, 9.0, 3.0], [2.0] * 4, [2.0] * 3),  # of an arm with other joints
-]
-
-
 def test_the_limit_of_a_joint_is_the_smaller_one_and_nodes_of_other_programs_leave_the_page_its_setup():
-    for ours, its, shown in LIMITED:
+    for ours, its, shown in [
+        ([3.0, 9.0, 3.0, 3.0], [0.0, 5.0, 0.0, 12.0], [3.0, 5.0, 3.0, 3.0]),
+        ([3.0, 9.0, 3.0], [2.0] * 4, [2.0] * 3),  # of an arm with other joints
+    ]:
         assert setup_of({"right": ({"max_effort": ours}, {"max_effort": its})})["arms"]["right"]["max_effort"] == shown
     bridge = fitting("/right/can_bridge", {"max_effort": "much", "can.channel": ["vcan0"], "rate": math.nan, "own": 1})
     compensator = fitting("/right/compensator", {"max_effort": 3.0, "support": 0.5, "payload.mass": math.inf})

@@ -25,8 +25,6 @@ pytestmark = [*IN_BROWSER, pytest.mark.real_time]
 
 
 RECORDING = 50_000  # bytes of a file into which joint states are written
-LONG = {"name": "long", "steps": [{"move": [0.0, 0.3, 0.3, 0.3], "over": 1.0}, {"hold": 120.0}]}
-AWAY = {"name": "away", "steps": [{"move": [0.0, 0.9, 0.6, 0.8], "over": over} for over in (2.0, 60.0)]}
 
 
 def panel_diagnostics(bag: Path) -> list[str]:
@@ -40,8 +38,14 @@ def panel_diagnostics(bag: Path) -> list[str]:
 def clinic(tmp_path: Path) -> Iterator[tuple[LaunchedNodes, RosProbe, Page]]:
     """The nodes of the right arm, which is carried, with trials; a probe, and the open page."""
     (tmp_path / "scripts").mkdir()
-    (tmp_path / "scripts" / "long.yaml").write_text(yaml.safe_dump(LONG))
-    (tmp_path / "away.yaml").write_text(yaml.safe_dump(AWAY))
+    (tmp_path / "scripts" / "long.yaml").write_text(
+        yaml.safe_dump({"name": "long", "steps": [{"move": [0.0, 0.3, 0.3, 0.3], "over": 1.0}, {"hold": 120.0}]})
+    )
+    (tmp_path / "away.yaml").write_text(
+        yaml.safe_dump(
+            {"name": "away", "steps": [{"move": [0.0, 0.9, 0.6, 0.8], "over": over} for over in (2.0, 60.0)]}
+        )
+    )
     nodes = LaunchedNodes(tmp_path, compensator={"wearer": {"body_mass": 60.0}, "support": 0.0}, wearer=True)
     url = nodes.add_panel(trials=str(tmp_path / "scripts"))
     nodes.start()

@@ -18,8 +18,6 @@ from exo_gravity.nodes.ros.inner import NodeExecutor
 
 from .waiting import wait_until
 
-InvalidHandle = rclpy_implementation.InvalidHandle
-
 
 class NodeThread:
     """Nodes with these names in a separate context, which a thread spins from `start` until `close`.
@@ -42,7 +40,7 @@ class NodeThread:
 
     def _spin(self) -> None:
         while not self._closing:
-            with suppress(InvalidHandle):  # a test has just destroyed a publisher
+            with suppress(rclpy_implementation.InvalidHandle):  # a test has just destroyed a publisher
                 self.executor.spin_once(timeout_sec=0.1)
 
     def close(self) -> None:

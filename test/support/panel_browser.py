@@ -19,8 +19,6 @@ IN_BROWSER = [
     pytest.mark.skipif(not CHROMIUM, reason="no browser: install chromium (apt-get install chromium)"),
     pytest.mark.timeout(300),
 ]
-# As root, and without a graphics card.
-FLAGS = ["--no-sandbox", "--enable-unsafe-swiftshader", "--force-color-profile=srgb"]
 PATIENCE = 60_000.0  # ms; a busy machine draws slowly
 
 
@@ -35,7 +33,11 @@ def chromium(gives_way: bool = False) -> Iterator[Browser]:
         program = Path(folder, "chromium")
         program.write_text(f'#!/bin/sh\nexec {"chrt --idle 0 " if gives_way else ""}{CHROMIUM} "$@"\n')
         program.chmod(0o755)
-        browser = playwright.chromium.launch(executable_path=program, args=FLAGS, timeout=PATIENCE)
+        browser = playwright.chromium.launch(
+            executable_path=program,
+            args=["--no-sandbox", "--enable-unsafe-swiftshader", "--force-color-profile=srgb"],
+            timeout=PATIENCE,
+        )
         yield browser
         browser.close()
 

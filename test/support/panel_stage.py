@@ -22,7 +22,6 @@ from exo_gravity.panel.view import SETTABLE, LoadChanges, joint_rows, setup_of
 from . import PARTS
 from .ports import free_port
 
-BUS = {"can.interface": "virtual", "can.channel": "stage"}
 PERIOD = 0.1  # s between two states
 #: What a subject's file holds.
 WEARER_FILE = {
@@ -32,7 +31,6 @@ WEARER_FILE = {
     "limits.lower": [-0.5, -0.2, -0.2, 0.0],
     "limits.upper": [0.5, 1.5, 1.5, 2.0],
 }
-POWERED = ("proving signs", "ramping in", "active", "letting down")
 STATE_AFTER = {
     "let_down": "letting down",
     "enable": "active",
@@ -126,7 +124,11 @@ class PlayedArms:
         values |= {"limits acting": "none", **{f"{joint} temperature (degC)": "31" for joint in names}}
         values["pose to confirm (deg)"] = self.asked.get(name, "none")
         values["resume"] = "possible" if fault == "command_stale" else "has_cause"
-        values |= {"source": "simulated", "motors": "on" if state in POWERED else "off", "refusal": "none"}
+        values |= {
+            "source": "simulated",
+            "motors": "on" if state in ("proving signs", "ramping in", "active", "letting down") else "off",
+            "refusal": "none",
+        }
         values |= {"waiting for": "none", "joints outside limits": "none", "turn back (deg)": "none"}
         sentence = f"fault: {fault}: {name} elbow" if fault != "none" else state
         level = 2 if fault != "none" else 0
@@ -203,7 +205,7 @@ class Stage:
         self.server = PanelServer(host, self.port, token, self.control)
         trials, markers = list(self.files.trials), ["begin", "end", "a text of one's own"]
         self._own_setup = {"language": "auto", "dead_man": False, "trials": trials, "markers": markers}
-        self._bridge = values_of(CAN_BRIDGE, BUS, "can.options")
+        self._bridge = values_of(CAN_BRIDGE, {"can.interface": "virtual", "can.channel": "stage"}, "can.options")
         self._stopping = threading.Event()
         self._thread = threading.Thread(target=self._play, daemon=True)
         self._thread.start()

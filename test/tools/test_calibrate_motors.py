@@ -157,10 +157,13 @@ def moving_elbow(*pose: float) -> dict[str, object]:
     return {"motions": dict(zip(JOINTS, (*UP[:3], pose), strict=True))}
 
 
-MUTE = {"silent": (3,), "problems": ("ID 3: several replies to one command",)}
 # What is wrong with the arm, how often the person is asked to move the elbow, and what is said.
 REFUSED = {
-    "a silent motor": (MUTE, 0, r"ID 3: several replies to one command; IDs that answer: [\d, ]+\. An arm has 4 mot"),
+    "a silent motor": (
+        {"silent": (3,), "problems": ("ID 3: several replies to one command",)},
+        0,
+        r"ID 3: several replies to one command; IDs that answer: [\d, ]+\. An arm has 4 mot",
+    ),
     "too little": (moving_elbow(0.0, 0.0, 0.0, 0.1), 3, r"elbow: no motor turned .*; motor {3} by 5\."),
     "two": (moving_elbow(0.0, 0.5, 0.0, 0.6), 3, "motors {3} and {1} both turned, by 34 and 29 degrees"),
     "another": (moving_elbow(0.0, 0.6, 0.0, 0.0), 3, "elbow: motor {1} turned, which is that of abduction"),

@@ -33,7 +33,6 @@ NO_FILE = ["--params", "nowhere.yaml"]
 LAW = ["--output", "law.json"]
 IMU = ["imu", "--params", EXO, "--output"]
 BUDGET = ["--params", EXO, "--body-mass"]
-WEIGHT = ["--params", EXO, "--output", "new.yaml", "--bag", ".", "--lever", "0.3", "--mass"]
 LIMITS = ("--max-drift", "--max-drift-after-push", "--max-rate", "--min-hold")
 WRONG = [
     ("budget", ["--body-mass", "75", *NO_FILE], "nowhere.yaml"),
@@ -44,7 +43,11 @@ WRONG = [
     ("calibrate", [*IMU, "taken.yaml", "--bag", "."], "taken.html': must be a new file"),
     ("calibrate", [*IMU, EXO, "--bag", "."], "exo.yaml': must be a new file"),
     ("calibrate", [*IMU, "none/new.yaml", "--bag", "."], "none/new.yaml"),
-    ("calibrate", ["scale", *WEIGHT, "0.01"], "mass times lever"),
+    (
+        "calibrate",
+        ["scale", "--params", EXO, "--output", "new.yaml", "--bag", ".", "--lever", "0.3", "--mass", "0.01"],
+        "mass times lever",
+    ),
     ("doctor", NO_FILE, "nowhere.yaml"),
     ("report", ["nothing"], "nothing: no such file"),
     ("report", ["run[1]"], "run[1]: must be a rosbag2 folder"),
@@ -89,7 +92,6 @@ def test_wrong_use_ends_with_2_and_a_sentence(tool, words, sentence, tmp_path, m
 BRIDGE, COMPENSATOR, SIMULATOR = "/right/can_bridge", "/right/compensator", "/right/simulator"
 NODES = yaml.safe_load((CONFIG / "sim.yaml").read_text())
 CAN = NODES[BRIDGE]["ros__parameters"]["can"]
-BITRATES = {**CAN, "options": {**CAN["options"], "bitrate": [500_000, 1_000_000]}}
 SLOW = {"interface": "virtual", "channel": "slow", "options": {"bitrate": 250_000}}
 LOCKED = {"interface": "virtual", "channel": f"vcan{os.getpid()}"}
 JOINTS = NODES[BRIDGE]["ros__parameters"]["joint_names"]
@@ -109,7 +111,8 @@ REFUSED_FILES: dict[str, tuple[dict[str, dict[str, Any]], str, str]] = {
     "a second imu": ({"/right/imu": {}}, "params = ['/imu', '/right/imu']", "one imu, which serves both arms"),
     "an expression": ({BRIDGE: {"zero": [0.0, "pi/8", 0.0, 0.0]}}, f"{BRIDGE} zero = 'pi/8'", "must be a number"),
     "an option that not every motor has": (
-        {BRIDGE: {"can": BITRATES}}, f"{BRIDGE} can.options.bitrate = [500000, 1000000]", "must be one value",
+        {BRIDGE: {"can": {**CAN, "options": {**CAN["options"], "bitrate": [500_000, 1_000_000]}}}},
+        f"{BRIDGE} can.options.bitrate = [500000, 1000000]", "must be one value",
     ),
     "a list that ROS reads for minutes": (
         {COMPENSATOR: {"gain": [1.0] * 50_000}}, f"{COMPENSATOR} gain = [1.0, 1.0",

@@ -21,8 +21,6 @@ from exo_gravity.tools import launcher
 
 from ..support import CONFIG, ROOT
 
-SIM = CONFIG / "sim.yaml"
-
 
 def test_a_closed_terminal_stops_the_launcher_as_ctrl_c_does():
     numbers = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
@@ -82,7 +80,7 @@ def launched(monkeypatch, run_tool):
         ended.set()
         monkeypatch.setattr(launcher, "stop_on_signals", lambda: ended)
         monkeypatch.setattr(subprocess, "Popen", start)
-        printed = run_tool("launcher", "--params", SIM, *words).out
+        printed = run_tool("launcher", "--params", CONFIG / "sim.yaml", *words).out
         return commands, [" ".join(line.split()[1:]) for line in printed.splitlines()]
 
     return launched

@@ -477,7 +477,6 @@ def test_a_share_needs_a_wearer_the_trunks_tilt_and_something_to_carry():
 # Of many recordings: a row for each, one that fails is named, one that has not changed is not read again
 
 DRIFTS = (1.0, 2.0, 3.0)  # deg/min of the elbow
-DAY = 86_400 * 10**9  # ns
 JUDGING = cohort.Judging(HoldCriteria(), 2.0, 1)
 
 
@@ -491,7 +490,7 @@ def trials(tmp_path_factory):
     folder, session = tmp_path_factory.mktemp("written") / "trials", json.dumps(asdict(Session("P01")))
     for number, drift in enumerate(DRIFTS):
         with pytest.MonkeyPatch.context() as day:
-            day.setattr(made, "START", made.START + number * DAY)
+            day.setattr(made, "START", made.START + number * 86_400 * 10**9)
             content = [made.text_entry("/recorder/session", 0.0, session), *made.messages(drifting(drift))]
             made.write_bag(folder / f"day_{number}" / "bag", content)
     cut = made.write_bag(folder / "cut" / "bag", made.messages(drifting(3.0)))

@@ -39,7 +39,6 @@ from ..support import synthetic_bags as made
 from ..support.launched_nodes import PORTS, LaunchedNodes
 from ..support.waiting import PATIENCE
 
-POSE = (0.0, 0.4, 0.5, 1.0)  # rad
 SHORT = {"name": "short", "steps": [{"move": [0.1, 0.6, 1.2, 0.5], "over": 2.0}, {"hold": 4.0}]}
 RATED = (3.0, 9.0, 3.0, 3.0)  # Nm
 
@@ -167,7 +166,7 @@ TRUNK = {  # the trunk's motion, whether its acceleration is compensated, and ho
 def test_an_arm_with_little_friction_stays_where_it_is_unless_a_walking_trunks_acceleration_is_left_out(
     run, steps, inertial, least, most
 ):
-    script = {"name": "trunk", "steps": [{"move": [*POSE], "over": 2.0}, {"hold": 1.0}, *steps]}
+    script = {"name": "trunk", "steps": [{"move": [0.0, 0.4, 0.5, 1.0], "over": 2.0}, {"hold": 1.0}, *steps]}
     simulator = {"friction": {"coulomb": [0.03] * 4}, "trunk": {"pitch": 0.0, "roll": 0.0}, "imu.rate": 250.0}
     changes = {"simulator": simulator, "can_bridge": {"rate": 250.0}, "compensator": {"inertial": inertial}}
     _, folder = run("--offline", script=script, **changes)

@@ -39,7 +39,6 @@ from ...support import synthetic_bags as made
 Entries = Iterable[made.Entry]
 
 SECOND = 10**9
-DAY = 86_400 * SECOND
 STATES, COMMANDS, STEPS = (f"/right/{name}" for name in ("joint_states", "effort_commands", "wearer_step"))
 PARAMETERS, SESSION = "/recorder/parameters", "/recorder/session"
 TRIAL = made.trial(made.POSES, hold=6.0, rate=50.0)
@@ -319,7 +318,7 @@ def with_clock(shift: int) -> Entries:
         yield topic, kind, stamp + shift * is_set, data
 
 
-@pytest.mark.parametrize("shift", [-5 * SECOND, -3600 * SECOND, 2 * SECOND, 3600 * SECOND, 100 * DAY], ids=str)
+@pytest.mark.parametrize("shift", [-5 * SECOND, -3600 * SECOND, 2 * SECOND, 3600 * SECOND, 8_640_000 * SECOND], ids=str)
 def test_an_arm_that_held_has_held_whatever_the_clock_did(tmp_path, shift):
     report, arm, analysis = report_of(in_order(tmp_path / "bag", with_clock(shift)))
     assert not report.failures
