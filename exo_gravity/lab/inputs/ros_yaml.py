@@ -15,6 +15,7 @@ import math
 import re
 import sys
 from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
 from typing import Any, NoReturn
 
 import yaml
@@ -73,126 +74,104 @@ def _number(text: str) -> float | str:
     return number if is_normal or is_zero else text
 
 
+class _Loader(EventLoader):  # type: ignore[misc, valid-type]  # one of two classes
+    """Gives the tag of a text to those scalars only that are written in quotes, or with that tag."""
+
+
+_Loader.add_implicit_resolver("!plain", re.compile(""), None)
+
+
+@dataclass(frozen=True)
 class _Reader:
-    """One document's events. Raises ParameterError that names the file and the line."""
+    """What is in one document. Raises ParameterError that names the file and the line."""
 
-    def __init__(self, text: str, source: str) -> None:
-        self._source = source
-        self._events: Iterator[Any] = yaml.parse(text, EventLoader)
-        self._next: Any = None  # the event that is next
-        self._advance()
+    source: str
 
-    def nodes(self) -> Nodes:
+    def nodes(self, root: yaml.Node) -> Nodes:
         """Return the parameters of each node."""
-        nodes, lines = Nodes(), dict[str, int]()
-        if not isinstance(self._next, yaml.MappingStartEvent):
-            raise ParameterError("params", self._source, f"a mapping of {FORM}")
-        for key in self._mapping("", lines):
+        nodes: Nodes = {}
+        for key, line, value in self._entries("", root):
             if not NODE.fullmatch(key):
-                expected = f"the full name of one node, of letters A-Z, digits and _, as in {FORM} (line {lines[key]})"
+                expected = f"the full name of one node, of letters A-Z, digits and _, as in {FORM} (line {line})"
                 raise ParameterError("node name", key, expected)
-            nodes[key] = self._parameters(key)
-        if not nodes:
-            raise ParameterError("params", self._source, f"a mapping of {FORM}")
-        if not self._is(yaml.DocumentEndEvent) or not self._is(yaml.StreamEndEvent):
-            self._refuse("a second document", "one document, without '---' inside")
+            nodes[key] = self._parameters(key, value)
         return nodes
 
-    def _parameters(self, node: str) -> dict[str, Any]:
+    def _parameters(self, node: str, root: yaml.Node) -> dict[str, Any]:
         """Return the parameters of one node by their dotted names."""
-        keys, parameters = dict[str, int](), dict[str, Any]()
-        for key in self._mapping(node, keys):
+        found: dict[str, Any] = {}
+        for key, line, value in self._entries(node, root):
             if key != PARAMETERS:
-                raise ParameterError(node, key, f"of the form {FORM} (line {keys[key]})")
-            parameters = dict(self._flat(node, "", {}))
-        if not keys:
+                raise ParameterError(node, key, f"of the form {FORM} (line {line})")
+            found[key] = dict(self._flat(node, "", value, {}))
+        if not found:
             raise ParameterError(node, {}, f"of the form {FORM}")
-        return parameters
+        return dict(found[PARAMETERS])
 
-    def _flat(self, node: str, prefix: str, lines: dict[str, int]) -> Iterator[tuple[str, Any]]:
+    def _flat(self, node: str, prefix: str, root: yaml.Node, lines: dict[str, int]) -> Iterator[tuple[str, Any]]:
         """Yield the dotted name and the value of each parameter. lines: those of the names so far."""
-        own = dict[str, int]()
-        for key in self._mapping(f"{node} {prefix}".strip(), own):
-            name, line = f"{prefix}.{key}" if prefix else key, own[key]
-            if isinstance(self._next, yaml.MappingStartEvent):
-                yield from self._flat(node, name, lines)
+        for key, line, value in self._entries(f"{node} {prefix}".strip(), root):
+            name = f"{prefix}.{key}" if prefix else key
+            if isinstance(value, yaml.MappingNode):
+                yield from self._flat(node, name, value, lines)
                 continue
             if name in lines:
-                self._refuse_twice(f"{node} {name}", line, lines[name])
+                self.refuse(line, f"{node} {name}", f"given once: line {lines[name]} has it, too")
             lines[name] = line
-            yield name, self._value(f"{node} {name}", line)
+            yield name, self._value(f"{node} {name}", line, value)
 
-    def _mapping(self, what: str, lines: dict[str, int]) -> Iterator[str]:
-        """Yield the keys of the mapping that begins here; the caller reads each value. lines: receives their lines."""
-        if not self._is(yaml.MappingStartEvent):
-            self._refuse(what, f"a mapping, as in {FORM}")
-        while not self._is(yaml.MappingEndEvent):
-            if not isinstance(self._next, yaml.ScalarEvent) or not self._next.value:
-                self._refuse(what, "a mapping whose keys are names")
-            key, line = self._next.value, self._line
-            if key in lines:
-                self._refuse_twice(f"{what} {key}".strip(), line, lines[key])
-            lines[key] = line
-            self._advance()
-            yield key
+    def _entries(self, what: str, root: yaml.Node) -> Iterator[tuple[str, int, yaml.Node]]:
+        """Yield each key of a mapping with its line and its value."""
+        if not isinstance(root, yaml.MappingNode):
+            self.refuse(line_of(root), what, f"a mapping, as in {FORM}")
+        lines: dict[str, int] = {}
+        for key, value in root.value:
+            if not isinstance(key, yaml.ScalarNode) or not key.value:
+                self.refuse(line_of(key), what, "a mapping whose keys are names")
+            name = key.value
+            if name in lines:
+                self.refuse(line_of(key), f"{what} {name}".strip(), f"given once: line {lines[name]} has it, too")
+            lines[name] = line_of(key)
+            yield name, lines[name], value
 
-    def _value(self, name: str, line: int) -> Any:
+    def _value(self, name: str, line: int, node: yaml.Node) -> Any:
         """Return a scalar or a list of scalars of one type."""
-        if self._is(yaml.SequenceStartEvent):
-            items: list[Any] = []
-            while not self._is(yaml.SequenceEndEvent):
-                if not isinstance(self._next, yaml.ScalarEvent):
-                    raise ParameterError(name, "a list in a list", f"a list of values (line {self._line})")
-                items.append(self._scalar(name))
-            if not items:
-                raise ParameterError(name, [], f"given a value, or left out (line {line})")
-            if len(items) > MAX_LIST:
-                raise ParameterError(name, items, f"at most {MAX_LIST} entries; it has {len(items):,}")
-            if len({type(item) for item in items}) > 1:
-                # ROS's own parser refuses such a list without naming it.
-                text = next((item for item in items if isinstance(item, str)), "")
-                if text and {int, float} & {type(item) for item in items}:
-                    raise ParameterError(name, text, f"a number, like the others: it is a text (line {line})")
-                raise ParameterError(name, items, f"a list of one type: 1.0, not 1, next to 2.5 (line {line})")
-            return items
-        return self._scalar(name)
+        if isinstance(node, yaml.ScalarNode):
+            return self._scalar(name, node)
+        if inner := next((item for item in node.value if not isinstance(item, yaml.ScalarNode)), None):
+            raise ParameterError(name, "a list in a list", f"a list of values (line {line_of(inner)})")
+        items = [self._scalar(name, item) for item in node.value]
+        if not items:
+            raise ParameterError(name, [], f"given a value, or left out (line {line})")
+        if len(items) > MAX_LIST:
+            raise ParameterError(name, items, f"at most {MAX_LIST} entries; it has {len(items):,}")
+        if len({type(item) for item in items}) > 1:
+            # ROS's own parser refuses such a list without naming it.
+            text = next((item for item in items if isinstance(item, str)), "")
+            if text and {int, float} & {type(item) for item in items}:
+                raise ParameterError(name, text, f"a number, like the others: it is a text (line {line})")
+            raise ParameterError(name, items, f"a list of one type: 1.0, not 1, next to 2.5 (line {line})")
+        return items
 
-    def _scalar(self, name: str) -> bool | int | float | str:
-        text, is_quoted = self._next.value, self._next.style in ("'", '"') or self._next.tag == STRING
-        if not text and not is_quoted:
-            raise ParameterError(name, None, f"given a value, or left out (line {self._line})")
-        if not is_quoted and OCTAL.fullmatch(text):
+    def _scalar(self, name: str, node: yaml.ScalarNode) -> bool | int | float | str:
+        text: str = node.value
+        if node.style in ("'", '"') or (node.tag == STRING and not node.style):  # a block is read as what is plain
+            return text
+        if not text:
+            raise ParameterError(name, None, f"given a value, or left out (line {line_of(node)})")
+        if OCTAL.fullmatch(text):
             number = text.lstrip("+-0")
-            self._refuse(f"{name} {text}", f"{number} or {int(number, 8)}: with a leading 0, ROS reads it as octal")
-        self._advance()
-        return text if is_quoted else scalar(text)
+            expected = f"{number} or {int(number, 8)}: with a leading 0, ROS reads it as octal"
+            self.refuse(line_of(node), f"{name} {text}", expected)
+        return scalar(text)
 
-    def _advance(self) -> None:
-        """Go to the next event that holds content."""
-        self._next = next(self._events)
-        while isinstance(self._next, yaml.StreamStartEvent | yaml.DocumentStartEvent):
-            self._next = next(self._events)
-        if getattr(self._next, "anchor", None):
-            sign = "*" if isinstance(self._next, yaml.AliasEvent) else "&"
-            self._refuse(f"{sign}{self._next.anchor}", "written out: ROS reads no anchors and aliases")
+    def refuse(self, line: int, what: str, expected: str) -> NoReturn:
+        raise ParameterError(f"{self.source}, line {line}", what, expected)
 
-    def _is(self, kind: type) -> bool:
-        """Return whether the next event is of this kind, and pass over it if it is."""
-        if not isinstance(self._next, kind):
-            return False
-        if kind is not yaml.StreamEndEvent:
-            self._advance()
-        return True
 
-    @property
-    def _line(self) -> int:
-        return int(self._next.start_mark.line) + 1
-
-    def _refuse(self, what: str, expected: str, line: int = 0) -> NoReturn:
-        raise ParameterError(f"{self._source}, line {line or self._line}", what, expected)
-
-    def _refuse_twice(self, what: str, line: int, first: int) -> NoReturn:
-        self._refuse(what, f"given once: line {first} has it, too", line)
+def line_of(part: Any) -> int:
+    """Return the line in which a part of a document begins, from 1 on."""
+    return int(part.start_mark.line) + 1
 
 
 def read(text: str, source: str) -> Nodes:
@@ -202,7 +181,17 @@ def read(text: str, source: str) -> Nodes:
 
     Raises ParameterError with the line of what is refused, yaml.YAMLError for what is not YAML.
     """
-    return _Reader(text, source).nodes()
+    reader = _Reader(source)
+    for event in yaml.parse(text, EventLoader):
+        if anchor := getattr(event, "anchor", None):
+            sign = "*" if isinstance(event, yaml.AliasEvent) else "&"
+            reader.refuse(line_of(event), f"{sign}{anchor}", "written out: ROS reads no anchors and aliases")
+    documents = [*yaml.compose_all(text, _Loader)]
+    if not documents or not isinstance(documents[0], yaml.MappingNode) or not documents[0].value:
+        raise ParameterError("params", source, f"a mapping of {FORM}")
+    if len(documents) > 1:
+        reader.refuse(line_of(documents[1]), "a second document", "one document, without '---' inside")
+    return reader.nodes(documents[0])
 
 
 class _Text(str):
