@@ -52,7 +52,6 @@ WRONG = [
     ("report", ["nothing"], "nothing: no such file"),
     ("report", ["run[1]"], "run[1]: must be a rosbag2 folder"),
     ("report", [".", "--scheduler", "my cluster"], "scheduler = 'my cluster': must be an address"),
-    ("report", ["--repair", "nothing"], "no such file"),
     *(("report", ["b", f"{o}={v}"], f"{o}: {v}: must be a num") for o in LIMITS for v in ("nan", "-1", "half")),
     ("train_anfis", [*LAW, *NO_FILE], "nowhere.yaml"),
     ("train_anfis", [*LAW, "--bag", "nowhere"], "nowhere"),

@@ -11,7 +11,7 @@ from itertools import pairwise
 
 import numpy as np
 
-from exo_gravity.lab.bag.joints import JointSeries
+from exo_gravity.lab.bag.layout import JointSeries
 
 SECOND = 1_000_000_000  # ns
 LATEST = 2**62  # ns since 1970, in the year 2116; a later time is damage

@@ -7,7 +7,6 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from exo_gravity import pip_install
 from exo_gravity.core.params import Param, params_of
 from exo_gravity.core.vocabulary import Source
 from exo_gravity.lab.source import source_of
@@ -110,12 +109,9 @@ class Bag:
         return {"subject": np.full(len(columns["arm"]), self.session.subject, object), **columns}
 
     def to_frame(self) -> Any:
-        """Return `columns` as a pandas.DataFrame. Raises ModuleNotFoundError, one sentence, without pandas."""
-        try:
-            import pandas
-        except ModuleNotFoundError:
-            sentence = f"to_frame needs pandas, which is not installed: {pip_install('pandas')}"
-            raise ModuleNotFoundError(sentence, name="pandas") from None
+        """Return `columns` as a pandas.DataFrame. Raises ModuleNotFoundError without pandas."""
+        import pandas
+
         return pandas.DataFrame(self.columns())
 
 

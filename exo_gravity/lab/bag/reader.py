@@ -39,8 +39,7 @@ from exo_gravity.lab.bag.content import (
     arm_of,
     leaf,
 )
-from exo_gravity.lab.bag.joints import FIELDS, JointArrays, JointSeries
-from exo_gravity.lab.bag.layout import TYPES, Batch, Decoder
+from exo_gravity.lab.bag.layout import FIELDS, TYPES, Batch, Decoder, JointArrays, JointSeries
 from exo_gravity.lab.bag.storage import Storage
 from exo_gravity.lab.inputs.arms import recorded_of
 from exo_gravity.lab.inputs.parameter_file import recorded_parameters
@@ -165,7 +164,8 @@ class _Contents:
         """Add the messages of a recording. Note what the files lack, and which messages are damaged."""
         readers: dict[str, JointArrays | _Samples | _Few] = {content.IMU: self.trunk, content.TILT_TOPIC: self.tilt}
         for rows in storage.rows(lambda topic, kind: kind in (content.READ.get(topic), content.READ.get(leaf(topic)))):
-            for (topic, msgtype), batch in rows.by_topic():
+            for number in dict.fromkeys(rows.topic.tolist()):
+                (topic, msgtype), batch = rows.topics[number], rows.batch.of(rows.topic == number)
                 if topic not in readers and msgtype == JOINT_STATE:
                     kept = (FIELDS, self.every) if leaf(topic) == STATES else (("effort",), 1)
                     readers[topic] = self._joints[topic] = JointArrays(topic, *kept)

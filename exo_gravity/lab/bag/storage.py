@@ -50,7 +50,6 @@ EXPECTED = (
     "a rosbag2 folder with .mcap or .db3 files, or such a file, unpacked (of ROS 1: converted by "
     "`rosbags-convert --src FILE.bag --dst FOLDER`)"
 )
-REPAIRED = "_repaired"  # with which the names of complete copies end
 
 Wanted = Callable[[str, str], bool]  # (topic, type) -> whether to yield its messages
 Topic = tuple[str, str]  # name, type
@@ -63,25 +62,18 @@ class StoredRows(NamedTuple):
     topic: np.ndarray  #: (n,) number of each message's topic
     batch: Batch
 
-    def by_topic(self) -> Iterator[tuple[Topic, Batch]]:
-        """Yield each topic and its messages."""
-        for number in dict.fromkeys(self.topic.tolist()):
-            yield self.topics[number], self.batch.of(self.topic == number)
-
 
 class Storage:
     """A recording: a rosbag2 folder, or one of its files.
 
-    `rows` and `messages` fill: `topics`, the type of each topic, wanted or not; `announced`, by topic of an MCAP file,
-    its schema and channel; `cut_short`, where the last file ends too early, '' for complete files; `damaged`, the
-    number of parts that were left out; `notes`, sentences on files.
+    `rows` fills: `topics`, the type of each topic, wanted or not; `cut_short`, where the last file ends too early, ''
+    for complete files; `damaged`, the number of parts that were left out; `notes`, sentences on files.
     """
 
     def __init__(self, path: str | Path) -> None:
         """Find the files. Raises DataError if there are none, or if they are of more than one recording."""
         self.path = Path(path)
         self.topics: dict[str, str] = {}
-        self.announced: dict[str, tuple[Schema, Channel]] = {}
         self.cut_short = ""
         self.damaged = 0
         self.notes: list[str] = []
@@ -89,7 +81,16 @@ class Storage:
         check_name(path)
         if not self.path.exists():
             raise DataError(f"{path}: no such file or folder")
-        here = sorted(self.path.iterdir(), key=_natural) if self.path.is_dir() else [self.path]
+        here = (
+            sorted(
+                self.path.iterdir(),
+                key=lambda file: [  # bag_2 before bag_10
+                    int(part) if part.isdigit() else part for part in re.split(r"(\d+)", file.name)
+                ],
+            )
+            if self.path.is_dir()
+            else [self.path]
+        )
         files = [f for f in here if f.is_file() and (f == self.path or not f.name.startswith("."))]
         self.files = [file for file in files if kind_of(file)]
         if not self.files:
@@ -114,12 +115,6 @@ class Storage:
         if others := [file.name for file in self.files if file not in kept]:
             self.notes.append(f"not read, because metadata.yaml does not name it: {', '.join(others)}")
         return kept
-
-    def messages(self, wanted: Wanted) -> Iterator[tuple[str, str, int, bytes]]:
-        """Yield topic, type, time of arrival in ns since 1970 and bytes of each message of the `wanted` topics."""
-        for topics, topic, batch in self.rows(wanted):
-            for number, now, data in zip(topic.tolist(), batch.arrival.tolist(), batch.messages(), strict=True):
-                yield *topics[number], now, data
 
     def rows(self, wanted: Wanted) -> Iterator[StoredRows]:
         """Yield the messages of the `wanted` topics, file by file.
@@ -165,7 +160,6 @@ class Storage:
                         channel = Channel.read(ReadDataStream(BytesIO(data[begin:at])))
                         schema = schemas[channel.schema_id]
                         self.topics[channel.topic] = schema.name
-                        self.announced[channel.topic] = schema, channel
                         if wanted(channel.topic, schema.name):
                             chosen[channel.id] = channel.topic, schema.name
             except Exception:  # mcap raises whatever its reading meets
@@ -290,8 +284,3 @@ def _named_files(metadata: Path) -> list[str]:
         return [Path(path).name for path in content["rosbag2_bagfile_information"]["relative_file_paths"]]
     except (OSError, ValueError, yaml.YAMLError, LookupError, TypeError, RecursionError):
         return []
-
-
-def _natural(path: Path) -> list[int | str]:
-    """Return a sort key that puts bag_2 before bag_10."""
-    return [int(part) if part.isdigit() else part for part in re.split(r"(\d+)", path.name)]

@@ -1,10 +1,10 @@
 # Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
-"""Writes rosbag2 recordings (MCAP): from serialised messages, in a separate thread, and complete copies of cut ones.
+"""Writes rosbag2 recordings (MCAP) from serialised messages, in a separate thread.
 
 rosbags collects messages in a chunk of up to 1 MiB before it writes them. This writer closes the chunk and hands it to
 the kernel every 0.5 s, so a killed process loses no more than that. The index at the end of the file and metadata.yaml
-are then missing; `report` reads the chunks without them, and `report --repair` makes a complete copy. A slow disk
-delays this thread only: messages that find the queue full are lost and counted. A full disk ends the recording.
+are then missing; `report` reads the chunks without them. A slow disk delays this thread only: messages that find the
+queue full are lost and counted. A full disk ends the recording.
 """
 
 import contextlib
@@ -17,13 +17,11 @@ from pathlib import Path
 from typing import cast
 
 from rosbags.interfaces import Connection, Qos, QosDurability, QosHistory, QosLiveliness, QosReliability, QosTime
-from rosbags.rosbag2 import Reader, ReaderError, StoragePlugin, Writer, WriterError
-from rosbags.rosbag2.metadata import parse_qos
+from rosbags.rosbag2 import StoragePlugin, Writer, WriterError
 from rosbags.rosbag2.storage_mcap import McapWriter
-from rosbags.typesys import Stores, get_types_from_msg, get_typestore
+from rosbags.typesys import Stores, get_typestore
 
 from exo_gravity.core.errors import DataError
-from exo_gravity.lab.bag.storage import REPAIRED, Storage
 
 FLUSH_PERIOD = 0.5  # s
 MAX_WAITING = 2_000  # batches: 100 s at 20 Hz, about 100 MB of two arms at 500 Hz
@@ -40,13 +38,6 @@ def offered_qos(reliable: bool, transient_local: bool, depth: int) -> Qos:
     return Qos(QosHistory.KEEP_LAST, depth, reliability, durability, FOREVER, FOREVER, automatic, FOREVER, False)
 
 
-def _opened(folder: Path) -> Writer:
-    """Return a writer of a recording in the new `folder`. Raises WriterError or OSError."""
-    writer = Writer(folder, version=Writer.VERSION_LATEST, storage_plugin=StoragePlugin.MCAP)
-    writer.open()
-    return writer
-
-
 class BagWriter:
     """A recording in the new folder `path`.
 
@@ -61,7 +52,8 @@ class BagWriter:
         self.count = self.lost = 0
         self._types = get_typestore(Stores.ROS2_JAZZY)
         try:
-            self._writer = _opened(self.path)
+            self._writer = Writer(self.path, version=Writer.VERSION_LATEST, storage_plugin=StoragePlugin.MCAP)
+            self._writer.open()
         except (WriterError, OSError) as error:
             raise DataError(f"{self.path}: cannot record there ({error})") from None
         self._storage = cast(McapWriter, self._writer.storage)
@@ -127,42 +119,3 @@ class BagWriter:
     def _finish(self) -> None:
         self._is_open = False
         self._writer.close()
-
-
-def is_complete(path: str | Path) -> bool:
-    """Return whether rosbags' own reader opens the recording. Raises DataError if there is none."""
-    Storage(path)
-    try:
-        with Reader(path):
-            return True
-    except (ReaderError, OSError, AssertionError):
-        return False
-
-
-def repair(path: str | Path) -> tuple[Path, int]:
-    """Write a complete copy of an MCAP recording; return its folder and the number of messages in it.
-
-    Raises DataError if the recording is not MCAP, has no message, or has been repaired before.
-    """
-    source = Storage(path)
-    if other := next((file for file in source.files if file.suffix.lower() != ".mcap"), None):
-        raise DataError(f"{other}: must be an .mcap file; try `ros2 bag reindex`")
-    folder = source.path.resolve().with_name(f"{source.path.resolve().stem}{REPAIRED}")
-    types, connections, count = get_typestore(Stores.ROS2_JAZZY), dict[str, Connection](), 0
-    try:
-        for count, (topic, msgtype, stamp, data) in enumerate(source.messages(lambda topic, msgtype: bool(msgtype)), 1):
-            if count == 1:
-                writer = _opened(folder)
-            if topic not in connections:
-                schema, channel = source.announced[topic]
-                if msgtype not in types.fielddefs:
-                    types.register(get_types_from_msg(schema.data.decode(), msgtype))
-                qos = parse_qos(channel.metadata.get("offered_qos_profiles", ""))
-                connections[topic] = writer.add_connection(topic, msgtype, typestore=types, offered_qos_profiles=qos)
-            writer.write(connections[topic], stamp, data)
-        if not count:
-            raise DataError(f"{folder}: not written: the recording has no message")
-        writer.close()
-    except (WriterError, OSError) as error:
-        raise DataError(f"{folder}: cannot write the repaired recording ({error})") from None
-    return folder, count

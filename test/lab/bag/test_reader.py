@@ -11,7 +11,6 @@ import os
 import random
 import shutil
 import sqlite3
-import sys
 import tracemalloc
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
@@ -695,9 +694,3 @@ def test_each_sample_of_each_joint_of_each_arm_is_a_row_with_its_step_and_whethe
             }.items():
                 np.testing.assert_array_equal(rows[column], expected)
             assert [*zip(rows.step, rows.action, strict=True)] == [found[0] if found else (0, "") for found in inside]
-
-
-def test_without_pandas_one_sentence_says_what_to_install(bag, monkeypatch):
-    monkeypatch.setitem(sys.modules, "pandas", None)
-    with pytest.raises(ModuleNotFoundError, match=r"^to_frame needs pandas.*pip install 'pandas'"):
-        bag.to_frame()

@@ -1,5 +1,5 @@
 # Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
-"""Recordings of `BagWriter` and complete copies of cut ones, read by independent readers; also of a killed process."""
+"""Recordings of `BagWriter`, read by independent readers; also of a killed process."""
 
 import signal
 import subprocess
@@ -7,17 +7,14 @@ import sys
 import threading
 from contextlib import closing
 
-import numpy as np
 import pytest
-from mcap.reader import make_reader
 from rosbags.highlevel import AnyReader
 from rosbags.interfaces import QosDurability, QosReliability
-from rosbags.rosbag2 import Reader, ReaderError, StoragePlugin, Writer
+from rosbags.rosbag2 import Writer
 
 from exo_gravity.core.errors import DataError
 from exo_gravity.lab.bag.reader import read_bag
-from exo_gravity.lab.bag.writer import BagWriter, is_complete, offered_qos, repair
-from exo_gravity.tools.report import main
+from exo_gravity.lab.bag.writer import BagWriter, offered_qos
 
 from ...support import ROOT
 from ...support import synthetic_bags as made
@@ -113,55 +110,3 @@ def test_a_killed_recorder_loses_at_most_the_last_second(tmp_path):
     written = len(read.recordings[0].time)
     assert stamps[-1] - stamps[written - 1] < 1e9
     assert "cut short" in read.notes[0]
-
-
-@pytest.fixture
-def cut(tmp_path):
-    """The folder of a recording whose file ends within a chunk, without metadata.yaml."""
-    content = list(made.messages(made.trial(made.POSES, hold=6.0, rate=500.0)))
-    with closing(BagWriter(tmp_path / "bag")) as writer:
-        for topic, msgtype in {item[0]: item[1] for item in content}.items():
-            writer.add_topic(topic, msgtype, offered_qos("step" not in topic, "step" in topic, 1))
-        writer.write([(topic, stamp, data) for topic, _, stamp, data in content])
-    made.cut(tmp_path / "bag" / "bag.mcap", 2 / 3)
-    (tmp_path / "bag" / "metadata.yaml").unlink()
-    return tmp_path / "bag"
-
-
-def test_the_copy_has_every_message_with_index_types_and_quality_of_service_and_rosbags_opens_it(cut):
-    with pytest.raises((ReaderError, FileNotFoundError)), Reader(cut):
-        pass
-    original = (cut / "bag.mcap").read_bytes()
-    folder, count = repair(cut)
-    assert folder == cut.with_name("bag_repaired") and (cut / "bag.mcap").read_bytes() == original
-    with (folder / "bag_repaired.mcap").open("rb") as file:
-        summary = make_reader(file).get_summary()
-    assert summary.statistics.message_count == count > 1000 and summary.chunk_indexes
-    with AnyReader([folder]) as reader:
-        offered = {c.topic: c.ext.offered_qos_profiles[0].durability.name for c in reader.connections}
-        stamps = [stamp for c, stamp, data in reader.messages() if reader.deserialize(data, c.msgtype)]
-        assert reader.message_count == count == len(stamps)
-    assert stamps == sorted(stamps)
-    assert offered[STEPS] == "TRANSIENT_LOCAL" and offered[STATES] == "VOLATILE"
-    (before,), (after,) = read_bag(cut).recordings, read_bag(folder).recordings
-    np.testing.assert_array_equal(after.position, before.position)
-    np.testing.assert_array_equal(after.command, before.command)
-    assert after.steps == before.steps and not read_bag(folder).notes
-
-
-def test_a_recording_is_repaired_once_on_the_command_line_also_a_single_file(cut, capsys):
-    repaired = cut.with_name("bag_repaired")
-    assert main(["--repair", str(cut / "bag.mcap")]) == 0
-    assert (cut / "bag_repaired").is_dir() and is_complete(cut / "bag_repaired")
-    for path, code, words in ((cut, 0, str(repaired)), (cut, 2, "exists already"), (repaired, 0, "nothing to repair")):
-        assert main(["--repair", str(path)]) == code
-        printed = capsys.readouterr()
-        assert words in printed.out + printed.err
-
-
-def test_a_recording_without_messages_or_of_another_format_is_refused(tmp_path):
-    (tmp_path / "empty.mcap").write_bytes(b"\x89MCAP0\r\n")
-    made.write_bag(tmp_path / "sqlite", [made.text_entry("/a", 0.0, "b")], StoragePlugin.SQLITE3)
-    for name, words in (("empty.mcap", "no message"), ("sqlite", r"an \.mcap file"), ("nothing", "no such file")):
-        with pytest.raises(DataError, match=words):
-            repair(tmp_path / name)
