@@ -10,26 +10,35 @@ from typing import Any
 
 import numpy as np
 
+from exo_gravity.core.arm.interface import STANDARD_GRAVITY
+from exo_gravity.core.arm.tilt import pitch_roll
 from exo_gravity.core.safety.drive import State
 from exo_gravity.core.vocabulary import TEXT, Source
 from exo_gravity.lab.bag import content
-from exo_gravity.lab.bag.content import JOINT_STATE, STRING, Event, NodeStatus
+from exo_gravity.lab.bag.content import JOINT_STATE, STRING, Event
 from exo_gravity.lab.bag.layout import TYPES
 from exo_gravity.lab.bag.writer import BagWriter, Message, offered_qos
 from exo_gravity.lab.trial.recording import Recording
 from exo_gravity.lab.trial.session import Session
+from exo_gravity.sim.virtual_arm import TrunkReading
 
 STATUS = content.READ[content.DIAGNOSTICS]
 Unsent = tuple[str, float, str, tuple[Any, ...]]  # topic, s, type, and the message's fields after its header, if any
 
 
 def write_recordings(
-    path: Path, arms: Sequence[Recording], events: Iterable[Event], parameters: Mapping[str, str], session: Session
+    path: Path,
+    arms: Sequence[Recording],
+    events: Iterable[Event],
+    parameters: Mapping[str, str],
+    session: Session,
+    trunk: Iterable[tuple[float, TrunkReading]] = (),
 ) -> None:
     """Write simulated arms to a new recording `path`, as `recorder` writes real ones; time 0 is now.
 
     events: what went wrong.
     parameters: YAML text by node.
+    trunk: what its IMU reads, each with its time in s.
 
     Raises DataError if it cannot be written.
     """
@@ -37,8 +46,13 @@ def write_recordings(
     messages: list[Unsent] = [
         *((content.PARAMETERS, 0.0, STRING, (text,)) for text in parameters.values()),
         (content.SESSION, 0.0, STRING, (json.dumps(asdict(session)),)),
-        *(_of_event(event.time, event.status) for event in events if event.status),
+        *(
+            _status(event.time, s.level, s.node, s.message, **{"fault": s.fault, f"fault{TEXT}": s.fault_text})
+            for event in events
+            if (s := event.status)
+        ),
         *(message for arm in arms for message in _of_arm(arm)),
+        *(message for now, reading in trunk for message in _of_trunk(now, reading)),
     ]
     messages.sort(key=lambda message: message[1])
     writer = BagWriter(path)
@@ -68,10 +82,15 @@ def _of_arm(arm: Recording) -> Iterator[Unsent]:
         last = now
 
 
-def _of_event(now: float, status: NodeStatus) -> Unsent:
-    """Return the message of a status, as a node sends it."""
-    fault = {"fault": status.fault, f"fault{TEXT}": status.fault_text}
-    return _status(now, status.level, status.node, status.message, **fault)
+def _of_trunk(now: float, reading: TrunkReading) -> Iterator[Unsent]:
+    """Yield what the node `imu` publishes of a reading: tilt and, in the trunk's axes, what its sensor measures."""
+    made: dict[str, Any] = TYPES.types
+    vector, none = made["geometry_msgs/msg/Vector3"], np.zeros(9)
+    pitch, roll = pitch_roll(reading.gravity)
+    felt = reading.specific_force or [-STANDARD_GRAVITY * x for x in reading.gravity]
+    turning, at_rest = vector(*map(float, reading.angular_velocity)), made["geometry_msgs/msg/Quaternion"](0, 0, 0, 1)
+    yield content.TILT_TOPIC, now, content.TILT_TYPE, (vector(roll, pitch, 0.0),)
+    yield content.IMU, now, content.READ[content.IMU], (at_rest, none, turning, none, vector(*felt), none)
 
 
 def _status(now: float, level: int, name: str, text: str, **values: str) -> Unsent:

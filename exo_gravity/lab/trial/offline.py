@@ -8,7 +8,6 @@ computer. `trial --offline` is the only tool that imports `sim`: without ROS it 
 
 import itertools
 import math
-import time
 from array import array
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
@@ -17,7 +16,6 @@ from pathlib import Path
 import numpy as np
 import yaml
 from rich.console import Console
-from rich.progress import Progress, TaskID
 
 from exo_gravity.core.compensation.compensator import Compensator
 from exo_gravity.core.compensation.settings import Settings
@@ -88,10 +86,11 @@ class OfflineTrial:
         self._carried: tuple[Span, ...] = ()  # from the first to the last time at which the motors carried the arm
         self._reason = ""  # why the compensator has withdrawn
         self._rows = array("d")
+        self.trunk: list[tuple[float, TrunkReading]] = []  #: each reading that differs from the one before, and its s
         self._carrier = VirtualArm(arm.device, self, arm.motors, arm.limits, arm.rate)
         self.safety = self._carrier.safety
         if arm.settings.use_imu and arm.trunk:
-            self._carrier.add_imu(arm.trunk, self.compensator, 1.0 / arm.rate)
+            self._carrier.add_imu(self._read_trunk, self.compensator, 1.0 / arm.rate)
 
     def run(self, should_stop: Callable[[float], bool] = lambda now: False) -> Recording:
         """Run the script, let the arm down, and return what `recorder` would have recorded.
@@ -139,6 +138,13 @@ class OfflineTrial:
         if reason and reason != self._reason:
             self._note(now, "compensator", f"withdrawn: {reason}", None)
         self._reason = reason
+
+    def _read_trunk(self, now: float, state: TrunkState) -> TrunkReading | None:
+        assert self.arm.trunk
+        reading = self.arm.trunk(now, state)
+        if reading and not (self.trunk and self.trunk[-1][1] is reading):
+            self.trunk.append((now, reading))
+        return reading
 
     def _abort(self, now: float, why: str, fault: Fault | None = None) -> None:
         why = f"{why} ({self._reason})" if self._reason else why
@@ -209,25 +215,15 @@ def record_offline(trial: Trial, console: Console, should_stop: Callable[[], boo
     assert trial.params is not None, "arms that are carried already are not simulated here"
     simulated = simulated_trials(trial.params, trial.script)
     nodes = load(trial.prepare(with_recorder=False))
-    recordings = []
-    with Progress(console=console, transient=True, disable=not console.is_terminal) as progress:
-        for one in simulated:
-            task, begin = progress.add_task(one.arm.name, total=one.script.duration), time.perf_counter()
-
-            def on_second(now: float, task: TaskID = task) -> bool:
-                progress.update(task, completed=now)
-                return should_stop()
-
-            recordings.append(one.run(on_second))
-            taken, length = time.perf_counter() - begin, float(recordings[-1].time[-1])
-            speed = f"{length:.0f} s simulated in {taken:.1f} s, {length / taken:.0f} times real time"
-            console.print(f"{one.arm.name}: {speed}")
+    with console.status("simulating"):
+        recordings = [one.run(lambda now: should_stop()) for one in simulated]
     events = sorted((event for one in simulated for event in one.events), key=lambda event: event.time)
     texts = {
         node: yaml.safe_dump({node: {"ros__parameters": values}}, default_flow_style=None, width=120)
         for node, values in nodes.items()
     }
-    write_recordings(trial.folder / "bag", recordings, events, texts, trial.session)
+    trunk = next((one.trunk for one in simulated if one.trunk), [])  # both arms hang on one
+    write_recordings(trial.folder / "bag", recordings, events, texts, trial.session, trunk)
     trouble = next((one.trouble for one in simulated if one.trouble), "")
     return TrialEnd(trouble, int(bool(trouble)))
 
