@@ -73,13 +73,11 @@ def parse(body: Any, arms: Collection[str], trials: Collection[str]) -> dict[str
     values = body.get("values") if isinstance(body.get("values"), dict) else {}
     if not values or not values.keys() <= CHANGEABLE.keys():
         raise ParameterError("values", list(values), f"an object with some of {', '.join(CHANGEABLE)}")
-    return {**body, "values": {key: _checked(key, value) for key, value in values.items()}}
-
-
-def _checked(name: str, value: Any) -> Any:
-    """Return the value of a setting, of an arm with any number of joints. Raises ParameterError."""
-    param = CHANGEABLE[name]
-    return (param.for_joints(len(value)) if isinstance(value, list) and value else param).check(value)
+    checked = {}
+    for key, value in values.items():  # of an arm with any number of joints
+        param = CHANGEABLE[key].for_joints(len(value)) if isinstance(value, list) and value else CHANGEABLE[key]
+        checked[key] = param.check(value)
+    return {**body, "values": checked}
 
 
 def without_value(error: ParameterError) -> str:

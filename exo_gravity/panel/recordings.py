@@ -215,15 +215,20 @@ class Recordings:
                 name, year, month, day, hour, minute, second, _ = match.groups()
                 *subject, _ = path.relative_to(self._output).parts
                 when = f"{year}-{month}-{day} {hour}:{minute}:{second}"
-                found.append({"subject": "".join(subject[:1]), "trial": name, "when": when, "report": key})
+                told: dict[str, Any] = {"verdict": "", "protocol": "", "seconds": None}
+                with contextlib.suppress(OSError, ValueError):  # none was written, or in part
+                    told |= json.loads((path / "report.json").read_text(encoding="utf-8"))
+                entry = {"subject": "".join(subject[:1]), "trial": name, "when": when, "report": key, **told}
+                folder = path.relative_to(self._output).as_posix() if (path / "bag").is_dir() else ""
+                found.append({**entry, "folder": folder})
         found.sort(key=lambda entry: entry["when"], reverse=True)
         kept = {path.parent.name for path in self._output.glob(f"*/{WEARER}")}
         return {"subjects": sorted(kept | {entry["subject"] for entry in found} - {""}), "past": found[:MOST_LISTED]}
 
-    def report(self, name: str) -> Path | None:
-        """Return the report in the folder `name` below `output`; None without one."""
-        with contextlib.suppress(OSError, ValueError):  # no file can have that name
-            path = (self._output / name / REPORT).resolve()
+    def file(self, name: str, pattern: str) -> Path | None:
+        """Return the first file of that pattern in the folder `name` below `output`; None without one."""
+        with contextlib.suppress(OSError, ValueError, NotImplementedError):  # no file can have that name
+            path = next((path.resolve() for path in sorted((self._output / name).glob(pattern))), self._output)
             return path if path.is_relative_to(self._output) and path.is_file() else None
         return None
 

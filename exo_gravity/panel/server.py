@@ -22,6 +22,7 @@ from collections import deque
 from collections.abc import Callable, Mapping
 from contextlib import suppress
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 from urllib.parse import parse_qs
@@ -60,6 +61,7 @@ SERVING = Serving()
 
 NOT_KNOWN: Mapping[str, Any] = {}
 FULL, REPLACED = 4000, 4001  # why a live connection was closed: too many pages; the page was opened again
+FILES = {"report": "report.html", "recording": "bag/*.mcap"}  # of a trial's folder that a page may open
 COOKIE = "exo_gravity_panel"
 # Nothing from elsewhere, no inline script or style, and no frame around the page, in which a press could be stolen.
 CONFINED = (
@@ -88,7 +90,7 @@ class PanelServer:
             Route("/", lambda request: FileResponse(FOLDER / "static" / "index.html")),
             Route("/strings", lambda request: FileResponse(FOLDER / "strings.json")),
             Route("/action", self._on_action, methods=["POST"]),
-            Route("/report/{name:path}", self._on_report),
+            *(Route(f"/{kind}/{{name:path}}", partial(self._on_file, pattern)) for kind, pattern in FILES.items()),
             Route("/sessions", lambda request: JSONResponse(control.files.past())),
             Route("/settings/{arm:path}", self._on_settings),
             Route("/parameters", lambda request: JSONResponse(control.arms.parameters())),
@@ -182,9 +184,12 @@ class PanelServer:
     async def _on_login(self, request: Request) -> Response:
         return await self.access.login(request) if request.method == "POST" else RedirectResponse("/")
 
-    async def _on_report(self, request: Request) -> Response:
-        path = self._control.files.report(request.path_params["name"])
-        return FileResponse(path) if path else PlainTextResponse("404: no such report", 404)
+    async def _on_file(self, pattern: str, request: Request) -> Response:
+        name = request.path_params["name"]
+        if not (path := self._control.files.file(name, pattern)):
+            return PlainTextResponse("404: no such file", 404)
+        as_name = None if path.suffix == ".html" else f"{Path(name).name}{path.suffix}"  # that one is downloaded
+        return FileResponse(path, filename=as_name)
 
 
 class Access:
@@ -252,7 +257,8 @@ class Access:
         if self.is_open and not is_loopback(re.sub(r":\d*$", "", host).strip("[]")):
             return PlainTextResponse("403: the panel answers on loopback only: see docs/operating.md", 403)
         changes = scope.get("method") not in ("GET", "HEAD")  # a live connection has no method
-        if changes and not is_same_origin(headers.get("origin", ""), host):
+        origins = (f"http://{host.lower()}", f"https://{host.lower()}") if host else ()
+        if changes and headers.get("origin", "").lower() not in origins:
             return PlainTextResponse("403: this request does not come from the panel's page", 403)
         is_login = (scope["path"], scope.get("method")) == ("/login", "POST")
         if self.is_open or is_login or _equal(connection.cookies.get(COOKIE, ""), self._session):
@@ -276,11 +282,6 @@ def is_loopback(host: str) -> bool:
         return host == "localhost" or ipaddress.ip_address(host).is_loopback
     except ValueError:
         return False
-
-
-def is_same_origin(origin: str, host: str) -> bool:
-    """Return whether the page at `origin` (a header's value) came from the server that `host` names."""
-    return host != "" and origin.lower() in (f"http://{host.lower()}", f"https://{host.lower()}")
 
 
 def address_of(connection: HTTPConnection) -> str:

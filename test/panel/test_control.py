@@ -332,13 +332,18 @@ def test_a_trial_of_a_subject_is_followed_to_its_report_and_listed_also_after_a_
     assert end["trial"] == {"phase": "done", "name": "short", "problem": problem, "report": name}
     assert not end["recording"]["on"]
     restarted = Kept(tmp_path)
-    entry = {"subject": "P01", "trial": "short", "when": "2026-03-14 12:00:00", "report": name}
+    entry = {"subject": "P01", "trial": "short", "when": "2026-03-14 12:00:00", "report": name, "folder": ""}
+    entry |= {"verdict": "", "protocol": "", "seconds": None}
     assert restarted.past() == {"subjects": ["P01"], "past": [entry]}
     assert restarted.state()["session"]["subject"] == ""
-    assert restarted.report(name) == kept.out / name / "report.html"
+    assert restarted.file(name, "report.html") == kept.out / name / "report.html"
+    told = {"verdict": "It held.", "protocol": "pilot", "seconds": 61.5}
+    (kept.out / name / "report.json").write_text(json.dumps(told))
+    (kept.out / name / "bag").mkdir()
+    assert restarted.past()["past"] == [{**entry, **told, "folder": name}]
     (tmp_path / "report.html").touch()
     wrong = ("..", str(tmp_path), "\0", "a" * 3000, "../etc")  # no other file is served
-    assert [restarted.report(name) for name in wrong] == [None] * 5
+    assert [restarted.file(name, "report.html") for name in wrong] == [None] * 5
 
 
 def test_a_trial_that_cannot_start_says_why(kept, run_instead):

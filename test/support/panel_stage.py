@@ -150,7 +150,7 @@ class PlayedFiles:
     trials: tuple[str, ...] = ("demo", "two_poses")
     calls: list[str] = field(default_factory=list)
     reports: dict[str, Path] = field(default_factory=dict)  #: of trials, by name
-    recorded: list[dict[str, str]] = field(default_factory=list)  #: the past recordings
+    recorded: list[dict[str, Any]] = field(default_factory=list)  #: the past recordings
     wearers: dict[str, Any] = field(default_factory=dict)  #: the content of each subject's file
     content: dict[str, Any] = field(
         default_factory=lambda: {
@@ -161,8 +161,9 @@ class PlayedFiles:
         }
     )
 
-    def report(self, name: str) -> Path | None:
-        return self.reports.get(name)
+    def file(self, name: str, pattern: str) -> Path | None:
+        path = self.reports.get(name)
+        return path and next(path.parent.glob(pattern), None)
 
     async def record(self) -> str:
         self.content["recording"] = {"on": True, "foreign": False, "folder": "recordings/r", "seconds": 1}

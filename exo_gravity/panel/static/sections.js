@@ -111,7 +111,7 @@ export class Sections {
     write(byId("trial-step"), trial.phase === "running" && step ? stepText(step) : "");
     const report = byId("trial-report");
     report.hidden = !trial.report;
-    if (trial.report) report.href = reportAt(trial.report);
+    if (trial.report) report.href = fileAt("report", trial.report);
   }
 
   async showParameters() {
@@ -126,7 +126,7 @@ export class Sections {
 
 const FREE = { "limits.lower": -3.15, "limits.upper": 3.15 }; // rad: no edges
 const OFF = ["disabled", "fault"];
-const reportAt = (name) => `/report/${name.split("/").map(encodeURIComponent).join("/")}`;
+const fileAt = (kind, name) => `/${kind}/${name.split("/").map(encodeURIComponent).join("/")}`;
 
 // Marks events in the recording: by a button for each usual one, by a digit, or by a text of one's own and the key M.
 //
@@ -201,6 +201,7 @@ class Session {
     this.ended = ""; // the trial and the recording, likewise
     this.form.addEventListener("submit", (event) => this.use(event));
     byId("keep-wearer").addEventListener("click", () => send({ do: "keep_wearer" }));
+    byId("past-filter").addEventListener("input", () => this.filter());
     window.addEventListener("keydown", takeSpace, true);
   }
 
@@ -214,6 +215,7 @@ class Session {
     const { recording, session, trial } = state;
     for (const control of this.form.elements) control.disabled = !operates || !isOff;
     byId("keep-wearer").disabled = !operates || !session.subject;
+    byId("past-filter").disabled = !isOff;
     const present = JSON.stringify(session);
     if (present !== this.present) this.showPresent(session, this.present === "");
     this.present = present;
@@ -241,18 +243,29 @@ class Session {
     byId("past").replaceChildren(
       ...past.map((entry) => {
         const row = document.createElement("tr");
-        for (const text of [entry.when, entry.subject, entry.trial, ""]) row.insertCell().textContent = text;
-        const link = Object.assign(document.createElement("a"), { href: reportAt(entry.report), target: "_blank", rel: "noopener" });
-        if (entry.report) row.lastElementChild.append(Object.assign(link, { textContent: t("trial_report") }));
+        const length = entry.seconds === null ? "" : `${number(entry.seconds, 0)} s`;
+        const texts = [entry.when, entry.subject, entry.trial, entry.protocol, length, entry.verdict];
+        for (const text of texts) row.insertCell().textContent = text;
+        const links = row.insertCell();
+        const add = (kind, name, text) => links.append(Object.assign(document.createElement("a"), { href: fileAt(kind, name), target: "_blank", rel: "noopener", textContent: text }), " ");
+        if (entry.report) add("report", entry.report, t("trial_report"));
+        if (entry.folder) add("recording", entry.folder, "MCAP");
         return row;
       }),
     );
+    this.filter();
+  }
+
+  // Shows the rows that have every word of the filter.
+  filter() {
+    const words = byId("past-filter").value.toLowerCase().split(/\s+/);
+    for (const row of byId("past").rows) row.hidden = !words.every((word) => row.textContent.toLowerCase().includes(word));
   }
 }
 
 // A space is written in a text field that is enabled: the motors are off then.
 function takeSpace(event) {
-  if (event.code === "Space" && event.target.matches?.("#session input:enabled, #markers input:enabled")) event.stopPropagation();
+  if (event.code === "Space" && event.target.matches?.("#session input:enabled, #markers input:enabled, #past-filter:enabled")) event.stopPropagation();
 }
 
 function recordingText(recording) {
