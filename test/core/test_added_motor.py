@@ -1,5 +1,5 @@
 # Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
-"""An arm carried with a motor, and with a term, that another distribution provides: test/support/our_lab.
+"""An arm carried with a motor, a term and a law that another distribution provides: test/support/our_lab.
 
 Entry points are looked up once, and so forgotten before and after.
 """
@@ -52,7 +52,7 @@ def push(**given: Any) -> tuple[list[str], list[float]]:
     return arms[0].terms.active, np.subtract(*torques).tolist()
 
 
-def test_a_laboratory_s_own_motor_and_term_need_no_fork_and_all_bounds_hold(
+def test_a_laboratory_s_own_motor_term_and_law_need_no_fork_and_all_bounds_hold(
     monkeypatch: pytest.MonkeyPatch, request: pytest.FixtureRequest
 ) -> None:
     for found in (others, installed):
@@ -79,3 +79,7 @@ def test_a_laboratory_s_own_motor_and_term_need_no_fork_and_all_bounds_hold(
         ["our_push"],
         pytest.approx([0.5, 0.0, 2.0, -1.0]),
     )
+    both = ({"use_imu": False, "law": law} for law in ("our_half", "exact"))
+    arms = (Compensator(settings_of(values_of(COMPENSATOR, given))) for given in both)
+    torques = [arm.step(1.0, (0.1, 0.2, 0.3, 0.4), (0.0,) * 4).effort for arm in arms]
+    assert np.divide(*torques)[1:].tolist() == pytest.approx([0.5] * 3)  # gravity does not turn the first joint

@@ -1,5 +1,5 @@
 # Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
-"""A laboratory's own motor and term, in its own distribution: what CONTRIBUTING says, and no more.
+"""A laboratory's own motor, term and law, in its own distribution: what CONTRIBUTING says, and no more.
 
 Its board speaks MIT mode with the torque first, and replies with IDs of its own.
 """
@@ -9,6 +9,9 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
+from exo_gravity.core.arm.interface import Arm
+from exo_gravity.core.arm.tilt import Tilt
+from exo_gravity.core.compensation.laws import LawData
 from exo_gravity.core.compensation.terms.catalogue import TermParameters, TermState
 from exo_gravity.core.motors.frames import (
     COMMAND,
@@ -102,3 +105,21 @@ class Push(TermParameters):
     def torque(self, _state: TermState) -> tuple[float, ...]:
         """Return the constant torques, (n,) in Nm."""
         return tuple(self.effort)
+
+
+@dataclass(frozen=True)
+class Half:
+    """A law that carries half of the arm."""
+
+    arm: Arm
+
+    def outside(self, theta: Sequence[float], tilt: Tilt) -> str:
+        return ""
+
+    def torque(self, theta: Sequence[float], tilt: Tilt) -> tuple[float, ...]:
+        return tuple(0.5 * effort for effort in self.arm.torque(theta, tilt))
+
+
+def half(given: LawData) -> Half:
+    """Return the law for the settings in force."""
+    return Half(given.arm)
