@@ -34,6 +34,7 @@ extras = {
         "lz4>=4.0",
         "matplotlib>=3.8",
         "mcap>=1.2",
+        "pyarrow>=14.0",
         "rich>=13.0",
         "rosbags>=0.11",
         "scipy>=1.11",

@@ -1,26 +1,27 @@
 # Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
 """report BAG: what a recorded trial showed, as a table, CSV files, figures and one HTML page.
 
-Several recordings, or a folder of them, become one table and page, a row for each trial, and cohort.csv, a row for each
-joint; without --csv, --figures and --video. They are read by a process for each core or, with --scheduler, by the
+Several recordings, or a folder of them, become one table and page, a row for each trial, the statistics of each
+condition, and cohort.csv, a row for each joint. They are read by a process for each core or, with --scheduler, by the
 workers of a Dask cluster.
 
-With --repair it instead writes a complete copy of a recording that was cut short, for `ros2 bag` and other tools.
-
-Exit code 0: the arms held, or the recording is complete. 1: one drifted more than allowed, or was never held. 2: wrong
+Exit code 0: the arms held. 1: one drifted more than allowed, or was never held. 2: wrong
 use, or part of a recording could not be read; the rest is reported first.
 """
 
 import argparse
 import math
 import os
-from collections.abc import Sequence
+from collections.abc import Callable, Iterable, Sequence
 from functools import partial
 from glob import glob
 from pathlib import Path
 
 from exo_gravity.core.errors import ParameterError
-from exo_gravity.lab.report import video
+from exo_gravity.core.vocabulary import Source
+from exo_gravity.lab.bag.content import Bag
+from exo_gravity.lab.report import html, video
+from exo_gravity.lab.source import of_all
 from exo_gravity.lab.trial.analysis import MIN_HOLD, HoldCriteria
 from exo_gravity.tools.cli import exit_code, extras, non_negative, positive
 
@@ -30,11 +31,13 @@ def _arguments(args: Sequence[str] | None) -> argparse.Namespace:
     option = parser.add_argument
     bag = "rosbag2 folder, or an .mcap or .db3 file, complete or cut short; or several; or a folder of recordings"
     option("bag", nargs="+", help=bag)
-    option(
-        "--repair", action="store_true", help="write a complete copy, BAG_repaired, of a recording cut short; no report"
-    )
     option("--output", metavar="DIR", help="folder for the report (default: BAG_report next to the first recording)")
     option("--csv", action="store_true", help="also write the time series, time_series.csv, a row per sample and joint")
+    option("--parquet", action="store_true", help="the same table as time_series.parquet")
+    lerobot = "also write a LeRobot dataset (v3.0), an episode per recording, of this many frames per s"
+    option("--lerobot", type=positive, metavar="RATE", help=lerobot)
+    by = "what makes a condition of a study: protocol, mode, support (all)"
+    option("--by", nargs="+", choices=("protocol", "mode", "support"), metavar="KEY", help=by)
     every = "keep one of N samples of each arm: less memory, a coarser report (%(default)s)"
     option("--decimate", type=positive, default=1, metavar="N", help=every)
     option(
@@ -59,8 +62,6 @@ def _arguments(args: Sequence[str] | None) -> argparse.Namespace:
     # A name that exists is no pattern: `run[1]` is not `run1`.
     texts = [[text] if os.path.lexists(text) else sorted(glob(text)) or [text] for text in options.bag]
     options.bag = [Path(text) for found in texts for text in found]
-    if options.repair and len(options.bag) > 1:
-        parser.error("--repair takes one recording")
     if (options.width or options.font) and not options.figures:
         parser.error("--width and --font are those of --figures")
     return options
@@ -69,19 +70,7 @@ def _arguments(args: Sequence[str] | None) -> argparse.Namespace:
 def main(args: Sequence[str] | None = None) -> int:
     """Run the command line; return the exit code."""
     options = _arguments(args)
-    return exit_code("report", "report", lambda: (_repair if options.repair else _run)(options))
-
-
-def _repair(options: argparse.Namespace) -> int:
-    from exo_gravity.lab.bag.writer import is_complete, repair
-
-    (path,) = options.bag
-    if is_complete(path):
-        print(f"{path} is complete: nothing to repair")
-        return 0
-    folder, count = repair(path)
-    print(f"Written: {folder}, complete, with {count} messages")
-    return 0
+    return exit_code("report", "report", lambda: _run(options))
 
 
 def _run(options: argparse.Namespace) -> int:
@@ -90,25 +79,25 @@ def _run(options: argparse.Namespace) -> int:
     from exo_gravity.lab.bag.reader import read_bag
     from exo_gravity.lab.report import cohort, trial_report
     from exo_gravity.lab.report.figures import Part
-    from exo_gravity.lab.report.html import Print
 
     criteria = HoldCriteria(
         max_stray=math.radians(options.max_drift),
         max_stray_after_push=math.radians(options.max_drift_after_push),
         max_rate=math.radians(options.max_rate) / 60.0,
     )
+    look = {"width": options.width, "font": options.font}
+    on_paper = html.Print(options.figures, **{name: value for name, value in look.items() if value})
     (path, *more), screen = options.bag, Console(stderr=True)
     beside = path.resolve().with_name(f"{path.resolve().stem}_report")
     if more or options.scheduler or (path.is_dir() and cohort.recordings_below(path) not in ([], [path])):
-        return _run_cohort(options, criteria, Path(options.output or beside))
+        return _run_cohort(options, criteria, on_paper, Path(options.output or beside))
     clip = video.requested(options.video, options.video_speed)
     with screen.status(f"reading {path.name}"):
         bag = read_bag(path, options.decimate)
     report = trial_report.analyse(bag, criteria, options.min_hold)
-    look = {"width": options.width, "font": options.font}
-    on_paper = Print(options.figures, **{name: value for name, value in look.items() if value})
-    part = Part(options.joints, options.start, options.end)
-    written = trial_report.write(report, options.output or beside, on_paper, part, options.csv)
+    output, part = Path(options.output or beside), Part(options.joints, options.start, options.end)
+    _export(options, output, lambda: [bag])
+    written = trial_report.write(report, output, on_paper, part)
     if clip:
         clip.write(bag, screen)
     trial_report.print_report(report)
@@ -116,26 +105,41 @@ def _run(options: argparse.Namespace) -> int:
     return report.exit_code
 
 
-def _run_cohort(options: argparse.Namespace, criteria: HoldCriteria, output: Path) -> int:
+def _export(options: argparse.Namespace, output: Path, bags: Callable[[], Iterable[Bag]]) -> None:
+    """Write what other programs read. bags: returns the recordings, of which one at a time is in memory."""
+    if not (options.csv or options.parquet or options.lerobot):
+        return
+    from exo_gravity.lab.report.export import write_lerobot, write_time_series
+
+    output.mkdir(parents=True, exist_ok=True)
+    for suffix in (".csv",) * options.csv + (".parquet",) * options.parquet:
+        write_time_series(output / f"time_series{suffix}", bags())
+    if options.lerobot:
+        write_lerobot(output / "lerobot", bags(), options.lerobot)
+
+
+def _run_cohort(options: argparse.Namespace, criteria: HoldCriteria, on_paper: html.Print, output: Path) -> int:
     from rich.console import Console
     from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
+    from exo_gravity.lab.bag.reader import read_bag
     from exo_gravity.lab.bag.storage import check_name
     from exo_gravity.lab.parallel import in_processes, on_cluster
-    from exo_gravity.lab.report import cohort, overview
+    from exo_gravity.lab.report import cohort, study
     from exo_gravity.lab.report.table import write_rows
+    from exo_gravity.lab.report.trial_report import STAMPS
 
     found = [one for path in options.bag for one in (path.is_dir() and cohort.recordings_below(path)) or [path]]
     recordings = [*{one.resolve(): one for one in found}.values()]  # one that is named twice is one trial
-    of_one = options.csv, options.figures, options.video, options.joints, options.start, math.isfinite(options.end)
-    if any(of_one):
-        expected = "reported one by one, without --scheduler, for --csv, --figures, --video and a part of the overview"
-        raise ParameterError("recordings", len(recordings), expected)
+    of_one = {"--video": options.video, "--joints": options.joints, "--from": options.start}
+    given = [name for name, value in {**of_one, "--to": math.isfinite(options.end)}.items() if value]
+    if given:
+        raise ParameterError("recordings", len(recordings), f"one for {', '.join(given)}, which show a part of a trial")
+    keys = options.by or study.KEYS
     for recording in recordings:
         check_name(recording)
     output.mkdir(parents=True, exist_ok=True)
-    judging = cohort.Judging(criteria, options.min_hold, options.decimate)
-    cache = cohort.Cache(output / "cohort_cache.jsonl", judging)
+    work = partial(cohort.summary, criteria=criteria, min_hold=options.min_hold, every=options.decimate)
     run = partial(on_cluster, options.scheduler) if options.scheduler else in_processes
     screen = Console(stderr=True)
     columns = BarColumn(), MofNCompleteColumn(), TimeRemainingColumn(), TextColumn("left")
@@ -144,15 +148,22 @@ def _run_cohort(options: argparse.Namespace, criteria: HoldCriteria, output: Pat
         Progress(*columns, console=screen, transient=True, disable=not screen.is_terminal) as progress,
     ):
         task = progress.add_task("", total=len(recordings))
-        rows, known = cohort.summaries(recordings, judging, cache, run, lambda: progress.advance(task))
-    write_rows(output / "cohort.csv", rows)
-    trials = overview.trials_of(rows)
+        rows = cohort.summaries(recordings, work, run, lambda: progress.advance(task))
+    trials = study.trials_of(rows)
+    of_study = {"statistics": study.statistics(trials, keys), "differences": study.differences(trials, keys)}
+    for table, content in {"cohort": rows, **of_study}.items():
+        write_rows(output / f"{table}.csv", [*content])
+    readable = [*{row["recording"]: None for row in rows if row["verdict"]}]
+    _export(options, output, lambda: (read_bag(recording, options.decimate) for recording in readable))
+    stamp = STAMPS[of_all(Source(row["source"]) for row in trials if row["verdict"])]
+    drawn = study.figure(trials, keys)
+    png = html.saved(drawn, output / "cohort.png", stamp, on_paper) if drawn else b""
     name = options.bag[0].resolve().stem if len(options.bag) == 1 else f"{len(recordings)} recordings"
-    (output / "cohort.html").write_text(overview.page(trials, name), encoding="utf-8")
+    (output / "cohort.html").write_text(study.page(trials, name, keys, png), encoding="utf-8")
     console = Console(highlight=False, width=None if Console().is_terminal else 200)
-    overview.print_trials(trials, console)
-    console.print(f"{overview.summary_of(trials)}; {known} recordings had not changed", soft_wrap=True)
-    console.print(f"Written: cohort.csv and cohort.html in {output}", markup=False, soft_wrap=True)
-    if overview.problems_of(trials):
+    study.print_trials(trials, keys, console)
+    console.print(study.summary_of(trials), soft_wrap=True)
+    console.print(f"Written: cohort.html, its figure and tables in {output}", markup=False, soft_wrap=True)
+    if study.problems_of(trials):
         return 2
     return int(not all(row["held"] for row in trials))

@@ -66,7 +66,6 @@ def _run(options: argparse.Namespace, params: Path, clip: video.Clip | None, con
     except DataError:
         if not trouble:
             raise
-        trial_report.write_empty(folder, script.name, trouble)
     else:
         report, trouble = analysed(bag, script, guided, trouble)
         code = code or int(bool(trouble)) or report.exit_code

@@ -7,7 +7,6 @@ import json
 import math
 import os
 import re
-import shutil
 import signal
 from dataclasses import asdict, replace
 from functools import partial
@@ -17,9 +16,12 @@ from xml.etree import ElementTree
 
 import matplotlib.image
 import numpy as np
+import pandas
+import pyarrow.parquet
 import pytest
 import yaml
 from rich.console import Console
+from scipy import stats
 
 from exo_gravity.core import ArmModel, Tilt, gravity_torque
 from exo_gravity.core.arm.tilt import gravity_in_trunk
@@ -30,12 +32,11 @@ from exo_gravity.core.safety.limits import CAN_BRIDGE, limits_of
 from exo_gravity.core.vocabulary import Source
 from exo_gravity.lab.bag.content import Event, NodeStatus
 from exo_gravity.lab.bag.reader import read_bag
-from exo_gravity.lab.bag.writer import repair
 from exo_gravity.lab.inputs.arms import configured_arm
 from exo_gravity.lab.inputs.parameter_file import load
 from exo_gravity.lab.parallel import on_cluster
-from exo_gravity.lab.report import cohort, figures, html, wearer_share
-from exo_gravity.lab.report.trial_report import STAMPS, analyse, print_report, write, write_empty
+from exo_gravity.lab.report import cohort, figures, html, study, wearer_share
+from exo_gravity.lab.report.trial_report import STAMPS, analyse, print_report, write
 from exo_gravity.lab.trial.analysis import HoldCriteria
 from exo_gravity.lab.trial.analysis import analyse as analysis_of
 from exo_gravity.lab.trial.recording import Recording
@@ -146,7 +147,8 @@ def test_the_report_is_written_next_to_its_recording_and_on_request_time_series_
 ):
     assert run_tool("report", short_bag).code == 0
     written = {path.name for path in short_bag.with_name("short_report").iterdir()}
-    assert written == {"holds.csv", "motions.csv", "report.html", "right_drift.png", "right_overview.png"}
+    tables = {"holds.csv", "motions.csv", "report.html", "report.json"}
+    assert written == {*tables, "right_drift.png", "right_overview.png"}
     nowhere = run_tool("report", short_bag, "--output", short_bag / "metadata.yaml" / "report")
     assert nowhere.code == 2 and "cannot write the report there" in nowhere.err
     assert run_tool("report", short_bag, "--output", tmp_path, "--csv").code == 0
@@ -227,9 +229,6 @@ def test_a_recording_without_a_hold_is_reported_with_figures_and_1_and_of_nothin
     report = analyse(made.bag_of(replace(made.trial(made.POSES, hold=0.5, rate=100.0), steps=())))
     assert report.exit_code == 1 and "never still" in page_of(report).text
     assert (tmp_path / "right_overview.png").exists()
-    write_empty(tmp_path, "demo", "stopped by the operator")
-    text = page_in(tmp_path).text
-    assert "demo" in text and "Nothing was recorded: stopped by the operator." in text
 
 
 LIMITED = {  # what differs of the recording, which is carried until s; what is said, and the exit code
@@ -474,10 +473,10 @@ def test_a_share_needs_a_wearer_the_trunks_tilt_and_something_to_carry():
     assert "nothing to carry" in wearer_share.sentence(hanging.wearers["right"], Source.UNKNOWN)
 
 
-# Of many recordings: a row for each, one that fails is named, one that has not changed is not read again
+# Of many recordings: a row for each, and one that fails is named
 
 DRIFTS = (1.0, 2.0, 3.0)  # deg/min of the elbow
-JUDGING = cohort.Judging(HoldCriteria(), 2.0, 1)
+SUMMARY = partial(cohort.summary, criteria=HoldCriteria(), min_hold=2.0, every=1)
 
 
 def drifting(per_minute):
@@ -505,11 +504,8 @@ def test_a_folder_becomes_one_table_and_page_and_what_fails_is_named(trials, tmp
     ended, out = run_tool("report", trials, "--output", tmp_path / "out"), tmp_path / "out"
     text, page = " ".join(ended.out.split()), (out / "cohort.html").read_text(encoding="utf-8")
     assert ended.code == 2 and "SPARC % Verdict" in text and "text.mcap: not an MCAP file" in text
-    assert "4 of 4 trials held; recordings not read, or not completely: 1; 0 recordings had not changed" in text
-    changes = r"P01, right, unknown mode: change from one of 3 sessions to the next: drift (\S+) ± \S+ deg"
-    trend = re.search(changes, text)
-    assert float(trend[1]) == pytest.approx(1.0, abs=0.4)
-    assert "text.mcap: not an MCAP file" in page and trend[0] in page and page.count("<img ") == 1
+    assert "4 of 4 trials held; recordings not read, or not completely: 1" in text
+    assert "text.mcap: not an MCAP file" in page and page.count("<img ") == 1
     rows = csv_rows(out / "cohort.csv")
     assert len(rows) == 4 * len(made.NAMES) + 1
     elbow = [float(row["drift_deg_per_min"]) for row in rows if row["joint"] == made.NAMES[3] and row["subject"]]
@@ -517,30 +513,9 @@ def test_a_folder_becomes_one_table_and_page_and_what_fails_is_named(trials, tmp
     moved = np.degrees(np.ptp(np.vstack((np.zeros(4), made.POSES)), axis=0))
     first = [float(row["range_of_motion_deg"]) for row in rows if "day_0" in row["recording"]]
     np.testing.assert_allclose(first, moved, atol=0.5)
-    # Of whom nothing has changed nothing is read: its own summary would not be there. Named twice, it is one trial.
-    again = run_tool("report", trials, f"{trials}/.", "--output", out)
-    assert "must be reported one by one" in run_tool("report", trials, "--csv", "--output", out).err
-    assert again.code == 2 and "4 recordings had not changed" in again.out
-    assert csv_rows(out / "cohort.csv") == rows
-
-
-def test_a_recording_is_read_again_where_its_content_or_the_criteria_change_and_a_copy_is_no_trial(trials, tmp_path):
-    bag, path, rows = trials / "day_0" / "bag", tmp_path / "cache.jsonl", [{"arm": "right", "verdict": "It held."}]
-    cache = cohort.Cache(path, JUDGING)
-    key = cache.key(bag)
-    cache.put(key, rows)
-    with path.open("a") as stream:
-        stream.write('["cut')
-    assert cohort.Cache(path, JUDGING).rows[key] == rows
-    assert cohort.Cache(path, replace(JUDGING, min_hold=3.0)).key(bag) != key
-    before = cohort.recordings_below(trials)
-    copy, _ = repair(trials / "cut" / "bag")
-    assert cohort.recordings_below(trials) == before and cohort.recordings_below(copy) == [copy]
-    shutil.copytree(bag, tmp_path / "bag")
-    data = bytearray((bag / "bag.mcap").read_bytes())
-    data[len(data) // 2] ^= 1
-    (tmp_path / "bag" / "bag.mcap").write_bytes(data)
-    assert cache.key(tmp_path / "bag") != key
+    below = [row for row in rows if row["joint"] == made.NAMES[3]]
+    assert all(0.0 < float(row["drift_uncertainty_deg_per_min"]) < 1.0 for row in below)
+    assert re.search(r" [123]\.\d\d ± 0\.\d\d ", text)  # not 0.00 everywhere
 
 
 @pytest.mark.thorough
@@ -549,7 +524,7 @@ def test_when_a_worker_of_a_cluster_is_killed_no_recording_is_lost_and_none_is_t
 
     content = list(made.messages(drifting(1.0)))
     recordings = [made.write_bag(tmp_path / f"more_{number}" / "bag", content) for number in range(8)]
-    expected = [row for recording in recordings for row in cohort.summary(str(recording), JUDGING)]
+    expected = [row for recording in recordings for row in SUMMARY(str(recording))]
     workers = {"n_workers": 2, "threads_per_worker": 1, "dashboard_address": None}
     with LocalCluster(host="127.0.0.1", **workers) as cluster, Client(cluster) as client:
         running = sorted(client.run(os.getpid).values())[:1]
@@ -558,8 +533,7 @@ def test_when_a_worker_of_a_cluster_is_killed_no_recording_is_lost_and_none_is_t
             while running:
                 os.kill(running.pop(), signal.SIGKILL)
 
-        run, cache = partial(on_cluster, cluster.scheduler_address), cohort.Cache(tmp_path / "cache.jsonl", JUDGING)
-        assert cohort.summaries(recordings, JUDGING, cache, run, done) == (expected, 0)
+        assert cohort.summaries(recordings, SUMMARY, partial(on_cluster, cluster.scheduler_address), done) == expected
 
 
 def test_a_scheduler_that_does_not_answer_is_one_line(trials, monkeypatch, run_tool):
@@ -573,3 +547,102 @@ def test_a_move_along_a_bell_of_speed_is_smooth():
     recording = made.trial(made.POSES, hold=3.0, rate=200.0)
     assert -1.8 < cohort.smoothness(recording, analysis_of(recording)) < -1.3
     assert math.isnan(cohort.smoothness(recording, analysis_of(made.measured(made.still(made.POSES[0], 5.0)))))
+
+
+def trial_row(subject, mode, **values):
+    """Return a trial of the paper's right arm, as `study.trials_of` does; what is not given is unknown."""
+    of_whom = {"subject": subject, "protocol": "reaching", "arm": "right", "source": "real", "verdict": "It held."}
+    return {
+        **dict.fromkeys(cohort.COLUMNS),
+        **of_whom,
+        "mode": mode,
+        "recording": f"{subject}/{mode}/{values}",
+        **values,
+    }
+
+
+def test_conditions_and_their_paired_differences_are_those_that_pandas_and_scipy_find():
+    dice, subjects, modes = np.random.default_rng(7), [f"P{n}" for n in range(7)], ("one_g", "zero_g", "other")
+    own = dict(zip(subjects, dice.normal(4.0, 1.5, len(subjects)), strict=True))
+    rows = [
+        trial_row(subject, mode, drift_deg_per_min=own[subject] + effect + dice.normal(0.0, 0.6))
+        for subject in subjects
+        for mode, effect in zip(modes, (1.0, 0.0, 0.3), strict=True)
+        for _ in range(1 + subjects.index(subject) % 3)  # more trials do not count more
+        if (subject, mode) != ("P6", "zero_g")
+    ]
+    table = pandas.DataFrame(rows).pivot_table(index="subject", columns="mode", values="drift_deg_per_min")
+    words = {
+        "one_g": "right, reaching, One-G",
+        "zero_g": "right, reaching, Zero-G",
+        "other": "right, reaching, unknown mode",
+    }
+    found = {row["condition"]: row for row in study.statistics(rows)}
+    for mode in modes:
+        row, values = found[words[mode]], table[mode].dropna()
+        interval = stats.t.interval(0.95, len(values) - 1, values.mean(), stats.sem(values))
+        expected = (len(values), values.mean(), values.std(), *interval)
+        assert [row[key] for key in ("n", "mean", "sd", "low_95", "high_95")] == pytest.approx(expected)
+    by_words = {text: mode for mode, text in words.items()}
+    compared = [
+        (row, table[[by_words[row["from"]], by_words[row["to"]]]].dropna().to_numpy().T)
+        for row in study.differences(rows)
+    ]
+    tests = [stats.ttest_rel(after, before) for _, (before, after) in compared]
+    for (row, _), test in zip(compared, tests, strict=True):
+        interval = test.confidence_interval()
+        assert [row[key] for key in ("p", "low_95", "high_95")] == pytest.approx([test.pvalue, *interval])
+    left, least = 3, 0.0
+    for (row, _), test in sorted(zip(compared, tests, strict=True), key=lambda pair: pair[1].pvalue):
+        least, left = max(least, min(1.0, left * test.pvalue)), left - 1
+        assert row["p_holm"] == pytest.approx(least)
+    assert left == 0
+
+
+def test_recordings_of_one_wearer_count_one_by_one_and_are_not_compared():
+    rows = [trial_row("P1", mode, wearer_share=share) for mode in ("one_g", "zero_g") for share in (0.2, 0.4)]
+    assert [(row["n"], row["mean"]) for row in study.statistics(rows)] == [(2, pytest.approx(30.0))] * 2
+    assert not [*study.differences(rows)]
+
+
+@pytest.mark.usefixtures("without_pictures")
+def test_many_recordings_become_one_table_and_one_dataset_and_a_part_of_one_is_refused(trials, tmp_path, run_tool):
+    assert run_tool("report", trials, "--csv", "--parquet", "--lerobot", "25", "--output", tmp_path).code == 2
+    table = pyarrow.parquet.read_table(tmp_path / "time_series.parquet").to_pandas()
+    frames = {bag: read_bag(trials / bag / "bag").to_frame() for bag in ("cut", "day_0", "day_1", "day_2")}
+    for name, frame in frames.items():
+        rows = table[table.recording == str(trials / name / "bag")].drop(columns="recording")
+        pandas.testing.assert_frame_equal(rows.reset_index(drop=True), frame, check_dtype=False)
+    text = pandas.read_csv(tmp_path / "time_series.csv", keep_default_na=False, na_values={"command_nm": [""]})
+    pandas.testing.assert_frame_equal(text, table, check_dtype=False, rtol=1e-5)
+    # The layout of LeRobot v3.0, of which its own package read such a dataset.
+    root = tmp_path / "lerobot"
+    info = json.loads((root / "meta" / "info.json").read_text())
+    episodes = pandas.read_parquet(root / "meta" / "episodes" / "chunk-000" / "file-000.parquet")
+    tasks = pandas.read_parquet(root / "meta" / "tasks.parquet")
+    assert info["codebase_version"] == "v3.0" and info["fps"] == 25 and info["total_episodes"] == len(episodes) == 4
+    assert tasks.index.tolist() == ["cut", "day_0", "day_1", "day_2"] and tasks.task_index.tolist() == [0, 1, 2, 3]
+    begin, actions = 0, []
+    for (_, episode), frame in zip(episodes.iterrows(), frames.values(), strict=True):
+        place = {"chunk_index": episode["data/chunk_index"], "file_index": episode["data/file_index"]}
+        data = pandas.read_parquet(root / info["data_path"].format(**place))
+        assert (episode.dataset_from_index, episode.dataset_to_index) == (begin, begin + len(data)) == (
+            data["index"].iloc[0], data["index"].iloc[-1] + 1,
+        )  # fmt: skip
+        assert set(data.columns) == set(info["features"]) and episode.length == len(data)
+        np.testing.assert_allclose(np.diff(data.timestamp), 1 / 25, atol=1e-5)
+        joint = frame[(frame.joint == made.NAMES[1]) & frame.command_nm.notna()]
+        where = joint.time_s.iloc[0] + data.timestamp
+        for feature, column in (("observation.state", "position_rad"), ("action", "command_nm")):
+            expected = np.interp(where, joint.time_s, joint[column])
+            np.testing.assert_allclose(np.stack(data[feature])[:, 1], expected, atol=1e-4)
+        actions.append(np.stack(data["action"]))
+        begin += len(data)
+    told = json.loads((root / "meta" / "stats.json").read_text())["action"]
+    whole = np.concatenate(actions)
+    for name, expected in (("mean", whole.mean(axis=0)), ("std", whole.std(axis=0)), ("max", whole.max(axis=0))):
+        np.testing.assert_allclose(told[name], expected, rtol=1e-4, atol=1e-5)
+    again = run_tool("report", trials, "--lerobot", "25", "--output", tmp_path)
+    assert again.code == 2 and "a dataset is there already" in again.err
+    part = run_tool("report", trials, "--joints", "1", "--video", "a.gif", "--output", tmp_path)
+    assert part.code == 2 and "recordings = 5: must be one for --video, --joints" in part.err

@@ -14,7 +14,6 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from mpl_toolkits.mplot3d.axes3d import Axes3D
 from mpl_toolkits.mplot3d.proj3d import proj_transform
-from PIL import Image
 from rich.console import Console
 from rich.progress import track
 
@@ -30,7 +29,6 @@ from exo_gravity.lab.trial.recording import Recording
 from exo_gravity.lab.view import COLOURS, LINE, SPHERE, ArmView, Described, arm_shapes, described
 
 SIZE, GIF_SIZE, DPI = (6.4, 4.8), (4.8, 3.6), 100  # inches
-COLOURS_OF_A_GIF, SAMPLES = 64, 12  # one palette for all frames keeps it small
 INK, LEADER = "#282c34", "#969ca4"
 NO_TORQUE = 0.05  # Nm, below which a motor is off
 STEPS = {"move": "the wearer moves the arm", "hold": "hands off", "push": "a push"}
@@ -64,13 +62,8 @@ def write_clip(bag: Bag, path: Path, step: float, frame_rate: int, console: Cons
     try:
         stage = Stage(bag, GIF_SIZE if is_gif else SIZE)
         if is_gif:
-            few = np.concatenate([stage.picture(time) for time in times[:: 1 + len(times) // SAMPLES]])
-            found = np.unique(few.reshape(-1, 3), axis=0)  # each once: a torque is drawn by few pixels
-            palette = Image.fromarray(found[None]).quantize(COLOURS_OF_A_GIF)
-            drawings = (Image.fromarray(stage.picture(time)) for time in drawn)
-            first, *others = (one.quantize(palette=palette, dither=Image.Dither.NONE) for one in drawings)
-            duration = round(1000 / frame_rate)  # ms
-            first.save(path, save_all=True, append_images=others, duration=duration, loop=0)
+            pictures = [stage.picture(time) for time in drawn]
+            iio.imwrite(path, pictures, plugin="pillow", duration=round(1000 / frame_rate), loop=0)  # ms
             return
         with iio.imopen(path, "w", plugin="pyav") as file:
             file.init_video_stream("libx264", fps=frame_rate)

@@ -86,11 +86,6 @@ def verdict(sentence: str, reasons: Iterable[str] = (), good: bool = True) -> st
     return f'<div class="{kind}"><b>{escape(sentence)}</b>{_items(reasons)}</div>'
 
 
-def source(text: str) -> str:
-    """Return a banner that says where the numbers come from."""
-    return f'<p class="source">{escape(text)}</p>'
-
-
 def heading(text: str, level: int = 3) -> str:
     """Return a heading of a section (2) or of a part of one (3)."""
     return f"<h{level}>{escape(text)}</h{level}>"

@@ -16,7 +16,6 @@ from exo_gravity.lab.report import html
 from exo_gravity.lab.trial.analysis import Hold, Motion, TrialAnalysis
 from exo_gravity.lab.trial.recording import Recording
 
-ROWS = 100_000  # of a time series, that are written at once
 Arm = tuple[Recording, TrialAnalysis]
 Row = Mapping[str, Any]
 
@@ -146,12 +145,14 @@ def write_csv(folder: Path, kind: Kind, arms: Iterable[Arm], row_head: Callable[
             numbers = {column.key: column.of(one) for column in kind.columns}
             for joint, name in enumerate(recording.joint_names):
                 rows.append({**shared, "joint": name, **{key: values[joint] for key, values in numbers.items()}})
-    if rows:
-        write_rows(folder / f"{kind.name}.csv", rows)
+    write_rows(folder / f"{kind.name}.csv", rows)
 
 
 def write_rows(path: Path, rows: Sequence[Row]) -> None:
-    """Write rows of the same columns as CSV; an unknown number is an empty cell. Raises OSError."""
+    """Write rows of the same columns as CSV; an unknown number is an empty cell. Without rows, write nothing."""
+    if not rows:
+        path.unlink(missing_ok=True)  # of an earlier report
+        return
     with path.open("w", newline="", encoding="utf-8") as file:
         writer = csv.DictWriter(file, rows[0])
         writer.writeheader()
@@ -159,18 +160,6 @@ def write_rows(path: Path, rows: Sequence[Row]) -> None:
             numbers = {key: f"{value:.6g}" for key, value in row.items() if isinstance(value, float | np.floating)}
             unknown = {key: "" for key, text in numbers.items() if text in ("nan", "inf", "-inf")}
             writer.writerow({**row, **numbers, **unknown})
-
-
-def write_time_series(path: Path, columns: Mapping[str, np.ndarray]) -> None:
-    """Write the columns of `Bag.columns` as CSV; an unknown number is an empty cell."""
-    with path.open("w", newline="", encoding="utf-8") as file:
-        writer = csv.writer(file)
-        writer.writerow(columns)
-        for start in range(0, len(columns["time_s"]), ROWS):
-            parts = [column[start : start + ROWS] for column in columns.values()]
-            parts = [part.astype(float).round(6) if part.dtype.kind == "f" else part for part in parts]
-            for row in zip(*(part.tolist() for part in parts), strict=True):
-                writer.writerow("" if value != value else value for value in row)  # NaN alone differs from itself
 
 
 def arm_section(recording: Recording, analysis: TrialAnalysis, figures: Iterable[str]) -> Iterator[str]:

@@ -4,6 +4,7 @@
 The verdict says whether each arm held, and leads with the worst that happened, under the settings in force.
 """
 
+import json
 import math
 import re
 from collections.abc import Callable, Iterator, Sequence
@@ -45,7 +46,7 @@ TIMESTAMP = re.compile(r"_\d{8}_\d{6}$")  # which `trial` adds to the script's n
 MAX_EVENTS = 200
 # On each figure, unless the arm is known to be real.
 STAMPS = {Source.SIMULATED: "SIMULATED", Source.UNKNOWN: "source unknown", Source.REAL: ""}
-WRITTEN = (".csv", ".png", ".html", ".pdf", ".svg")
+WRITTEN = (".csv", ".png", ".html", ".pdf", ".svg", ".parquet", ".json")
 CAPTIONS = {
     "overview": "Positions, velocities and torques over time. Holds are shaded and numbered; thin lines "
     "show the command, dotted ones the limits.",
@@ -264,9 +265,8 @@ def write(
     folder: str | Path,
     on_paper: html.Print | None = None,
     part: "Part | None" = None,
-    with_time_series: bool = False,
 ) -> list[Path]:
-    """Write holds.csv, motions.csv, a PNG of each figure and report.html into `folder`; return the files.
+    """Write holds.csv, motions.csv, a PNG of each figure, report.html and report.json into `folder`; return the files.
 
     on_paper: how each figure is written beside its PNG. part: what the overview shows.
 
@@ -280,8 +280,6 @@ def write(
         folder.mkdir(parents=True, exist_ok=True)
         for kind in table.KINDS:
             table.write_csv(folder, kind, report.arms, report.row_head)
-        if with_time_series:
-            table.write_time_series(folder / "time_series.csv", report.bag.columns())
         for recording, analysis in report.arms:
             source = report.bag.source(recording.name)
             drawn = {
@@ -305,6 +303,9 @@ def write(
                 pictures.append(html.bullets("Wearer", shares))
             sections += table.arm_section(recording, analysis, pictures)
         (folder / "report.html").write_text(_page(report, sections), encoding="utf-8")
+        seconds = max(float(recording.time[-1]) for recording in report.bag.recordings)
+        told = {"verdict": report.verdict[0], "protocol": report.bag.session.protocol, "seconds": seconds}
+        (folder / "report.json").write_text(json.dumps(told), encoding="utf-8")
     except OSError as error:
         raise DataError(f"{folder}: cannot write the report there ({error.strerror})") from None
     return sorted(path for path in folder.iterdir() if path.suffix in WRITTEN)
@@ -316,13 +317,6 @@ def _limits(report: Report, recording: Recording) -> Limits | None:
         values = recorded_of(report.bag.parameters, recording.name, BRIDGE)
         return limits_of(values) if values else None
     return None
-
-
-def write_empty(folder: Path, name: str, trouble: str) -> None:
-    """Write the report of a trial that ended before anything was recorded."""
-    sentence = html.verdict(f"Nothing was recorded: {trouble}.", good=False)
-    page = html.document(name, f"{datetime.now():%Y-%m-%d %H:%M:%S}", [sentence])
-    (folder / "report.html").write_text(page, encoding="utf-8")
 
 
 def print_report(report: Report, console: Console | None = None) -> None:
@@ -362,7 +356,7 @@ def _page(report: Report, sections: Sequence[str]) -> str:
         ending.append(f"<details><summary>Parameters at the start</summary><pre>{escape(parameters)}</pre></details>")
     text, good = report.verdict
     head = [
-        html.source(STATEMENTS[of_all(bag.source(recording.name) for recording in bag.recordings)]),
+        f'<p class="source">{STATEMENTS[of_all(bag.source(recording.name) for recording in bag.recordings)]}</p>',
         html.verdict(text, report.failures, good),
         *_conditions(report),
     ]
