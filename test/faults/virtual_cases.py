@@ -75,6 +75,7 @@ DROP_SPEED, LOAD_LOST = 4.8, 2.9  # rad/s of the paper's arm and of the elbow, b
 FIRMWARE_FALL = 1.5
 CARELESS = 1.5  # rad/s, where the replies are lost: nobody knows how fast the joints are
 BOWING = 0.5  # rad/s
+EMPTY = 0.35  # s from an empty cuff until the arm is let down
 LET_DOWN = 1.5  # s from the death of who holds control
 GONE_FOR = 0.45  # s from the fault, in which the assistance is out; that of a sound stream may then return
 TOLERANCE = 0.08  # Nm
@@ -169,11 +170,11 @@ def stays_off(records: np.ndarray) -> str:
 
 
 def damped_for_a_moment(records: np.ndarray) -> str:
-    """Return what is wrong unless every motor damps the motion once, and none does so later."""
-    since = records["time"] - records["time"][0]
-    if not records["damping"][since < RIDE].max(axis=0, initial=0.0).all():
+    """Return what is wrong unless every motor damps the motion for a moment, and then no more than before."""
+    since, damping = records["time"] - records["time"][0], records["damping"]
+    if damping[since < RIDE].max(axis=0, initial=0.0).min() < 0.1:  # Nm s/rad
         return "ridden through without damping"
-    return "still damped after the ride" if records["damping"][since > RIDE].any() else ""
+    return "still damped after the ride" if (damping[since > RIDE] > damping[0] + 0.01).any() else ""
 
 
 def within_max_effort(records: np.ndarray) -> str:
@@ -549,6 +550,8 @@ LOAD_CHANGES = (
     load_case("max_effort 9 to 0.5 Nm, Zero-G, 75 kg", WEAK, RATED),
     FaultCase("a load of 2 kg is dropped, Zero-G, 75 kg", take_and_drop, LOADED, limit=None, outcomes=("active",),
         speed_limit=DROP_SPEED, afterwards=load_is_withdrawn),
+    FaultCase("the arm leaves the cuff, Zero-G, 75 kg", happens("out_of_cuff"), WORN, limit=EMPTY,
+        outcomes=("load_missing",), speed_limit=1.5, driven_limit=1.5, energy_limit=1.0),
 )
 ACTIVE_WEARER = (
     while_wearer("presses it down from the horizontal", PRESS_DOWN, 0.1, HIGH),

@@ -64,7 +64,8 @@ class SafetyRun:
             for i, change in enumerate(self.changes):
                 if i not in self.silent:
                     damped = self.applied[i] - self.drive.damping[i] * change.get("velocity", 0.0)
-                    torque = 0.0 if i in self.off else damped
+                    most = LIMITS.max_effort[i]
+                    torque = 0.0 if i in self.off else max(-most, min(most, damped))
                     self.joints[i] = reading(**{"time": self.now - 0.001, "effort": torque, **change})
             before = list(self.applied)
             hangs = self.effort is not None and self.machine.state is State.CHECKING

@@ -42,7 +42,7 @@ from exo_gravity.core.safety.drive import (
 from exo_gravity.core.safety.explain import MotionMonitor, RideThrough
 from exo_gravity.core.safety.guidance import GuidedMotion, guide_damping
 from exo_gravity.core.safety.limits import CONFIRM, DAMPING, DAMPING_RATE, MAX_EFFORT_RATE, Limits
-from exo_gravity.core.safety.shape import Shaper
+from exo_gravity.core.safety.shape import STILLNESS, Shaper
 from exo_gravity.core.safety.start import (
     HANGING_ARM,
     START_GATE,
@@ -236,6 +236,9 @@ class SafetyMachine:
             return self.watch.fault
         if self.state in CARRIED and (found_off := self._found_off()):
             return found_off
+        if self.shaper.empty_for >= STILLNESS.empty:
+            why = "motors drive the arm as if it were empty: is an arm in the cuff, the load in the hand, the IMU firm?"
+            return Fault(FaultCode.LOAD_MISSING, why)
         if efforts.effort is None:
             return Fault(FaultCode.COMMAND_WITHDRAWN, "the compensator withdrew its efforts; see its diagnostics")
         return self.ride.step(self._now, self._dt, self._now - efforts.answered, efforts.held)
