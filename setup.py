@@ -10,8 +10,8 @@ here = Path(__file__).resolve().parent  # `colcon build --symlink-install` runs 
 # The version, the description and the maintainer are those of package.xml, and nowhere else.
 declared = ElementTree.parse(here / "package.xml").getroot()
 # The one list of executables. The launcher reads the nodes from the entry points. A large node is a folder.
-nodes = ("can_bridge", "compensator", "panel", "recorder", "robot_model", "wearer")
-small_nodes = ("calibrator", "imu", "simulator")
+nodes = ("can_bridge", "compensator", "panel", "recorder")
+small_nodes = ("calibrator", "imu", "robot_model", "simulator", "wearer")
 tools = ("launcher", "trial", "report", "budget", "validate", "train_anfis", "calibrate", "urdf", "doctor")
 
 # What each command needs beyond what every one needs; a command that misses a package says how to install it.

@@ -107,7 +107,7 @@ def asking_on_terminal(bridges: Sequence[str], say: Callable[[str], None]) -> It
             say(CONFIRMING.format(bridge))
         yield
         return
-    with subprocess.Popen([*program(f"{NODES_PACKAGE}ros.pose_prompt", "pose_prompt"), *bridges]) as prompt:
+    with subprocess.Popen([*program(f"{NODES_PACKAGE}pose_prompt", "pose_prompt"), *bridges]) as prompt:
         try:
             yield
         finally:

@@ -26,7 +26,8 @@ from exo_gravity.core.trunk.inputs import TiltInput
 from exo_gravity.core.vocabulary import UNKNOWN
 from exo_gravity.lab.calibration.tour import calibrator_table, line_of, side_of, tour_of
 from exo_gravity.lab.vocabulary import NodeState
-from exo_gravity.nodes.ros.messages import ERROR, OK, WARN, Diagnostics, by_name, status_values
+from exo_gravity.nodes.others import status_values
+from exo_gravity.nodes.ros.messages import ERROR, OK, WARN, Diagnostics, by_name
 from exo_gravity.nodes.ros.parameters import declare, given_to
 from exo_gravity.nodes.ros.run import run
 from exo_gravity.nodes.ros.subscriptions import (

@@ -46,7 +46,7 @@ from exo_gravity.nodes.compensator.node import CompensatorNode
 from exo_gravity.nodes.ros.inner import NodeExecutor
 from exo_gravity.nodes.ros.messages import to_nanoseconds
 from exo_gravity.nodes.ros.subscriptions import LATCHED
-from exo_gravity.nodes.wearer.node import WearerNode
+from exo_gravity.nodes.wearer import WearerNode
 from exo_gravity.tools import train_anfis
 
 from ..support import CONFIG, PARTS, ROBOT

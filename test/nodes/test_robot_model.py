@@ -21,7 +21,7 @@ from exo_gravity.hardware.network import keep_to_this_machine
 from exo_gravity.lab.inputs.parameter_file import load
 from exo_gravity.lab.processes import node_modules
 from exo_gravity.lab.view import ROOT
-from exo_gravity.nodes.robot_model.node import RobotModel
+from exo_gravity.nodes.robot_model import RobotModel
 from exo_gravity.nodes.ros.subscriptions import LATCHED
 from exo_gravity.tools.urdf import urdf_of
 

@@ -51,11 +51,13 @@ from exo_gravity.core.params import Param
 from exo_gravity.hardware import network
 from exo_gravity.hardware.network import keep_to_this_machine, open_to_others
 from exo_gravity.lab.inputs.parameter_file import load
-from exo_gravity.nodes.ros import inner, pose_prompt, subscriptions
+from exo_gravity.nodes import pose_prompt
+from exo_gravity.nodes.others import NodeParameters
+from exo_gravity.nodes.ros import inner, subscriptions
 from exo_gravity.nodes.ros import run as running
 from exo_gravity.nodes.ros.inner import Until, prepare_transitions
 from exo_gravity.nodes.ros.messages import NO_POSE, POSE_TO_CONFIRM, milliseconds, row
-from exo_gravity.nodes.ros.parameters import NodeParameters, accept_changes, declare
+from exo_gravity.nodes.ros.parameters import accept_changes, declare
 from exo_gravity.nodes.ros.run import handle_signals
 from exo_gravity.nodes.ros.subscriptions import NEWEST_ONLY, PolledSubscription, Publishers
 

@@ -35,10 +35,11 @@ from exo_gravity.lab.bag.content import MARKERS
 from exo_gravity.lab.inputs.arms import fitting
 from exo_gravity.lab.packages import extras
 from exo_gravity.lab.vocabulary import NodeState
-from exo_gravity.nodes.ros.messages import HELD_BY, NOBODY, OK, Diagnostics, Statuses
-from exo_gravity.nodes.ros.parameters import OtherNodes, declare, plain
+from exo_gravity.nodes.others import Latest, OtherNodes, Statuses
+from exo_gravity.nodes.ros.messages import HELD_BY, NOBODY, OK, Diagnostics
+from exo_gravity.nodes.ros.parameters import declare, plain
 from exo_gravity.nodes.ros.run import run
-from exo_gravity.nodes.ros.subscriptions import MANY_REQUESTS, PITCH_YAW, Latest
+from exo_gravity.nodes.ros.subscriptions import MANY_REQUESTS, PITCH_YAW
 from exo_gravity.panel.control import Control
 from exo_gravity.panel.recordings import Recordings
 from exo_gravity.panel.view import PANEL, SETTABLE, LoadChanges, Values, joint_rows, setup_of

@@ -34,8 +34,8 @@ from exo_gravity.lab.bag import content
 from exo_gravity.lab.bag.content import PARAMETERS, STATES, arm_of, leaf
 from exo_gravity.lab.packages import extras
 from exo_gravity.lab.trial.session import Session
-from exo_gravity.nodes.ros.messages import status_values
-from exo_gravity.nodes.ros.parameters import OtherNodes, declare
+from exo_gravity.nodes.others import OtherNodes, status_values
+from exo_gravity.nodes.ros.parameters import declare
 from exo_gravity.nodes.ros.run import run
 from exo_gravity.nodes.ros.subscriptions import PITCH_YAW, PolledSubscription, Publishers
 

@@ -12,7 +12,6 @@ Levels of a status:
 import math
 import time
 from collections.abc import Iterable, Mapping, Sequence
-from typing import Any
 
 from builtin_interfaces.msg import Time
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
@@ -107,29 +106,6 @@ class Diagnostics:
                 logger.warning(message)
             else:
                 logger.error(message)
-
-
-class Statuses:
-    """The newest status of each node on /diagnostics."""
-
-    def __init__(self, node: Node) -> None:
-        self._newest: dict[str, tuple[float, dict[str, Any]]] = {}  # monotonic s of its arrival, and its values
-        node.create_subscription(DiagnosticArray, "/diagnostics", self._on_message, 50)
-
-    def within(self, timeout: float, name: str) -> dict[str, Any]:
-        """Return the `status_values` of the node, as 'right/can_bridge'; {} if they are older than `timeout` s."""
-        arrived, values = self._newest.get(name, (-math.inf, {}))
-        return values if time.monotonic() - arrived < timeout else {}
-
-    def _on_message(self, message: DiagnosticArray) -> None:
-        now = time.monotonic()
-        self._newest.update({status.name: (now, status_values(status)) for status in message.status})
-
-
-def status_values(status: DiagnosticStatus) -> dict[str, Any]:
-    """Return the values of a status by key, with its `level` as a number and its `message`."""
-    values = {pair.key: pair.value for pair in status.values}
-    return values | {"level": int.from_bytes(status.level, "big"), "message": status.message}
 
 
 def row(values: Iterable[float], digits: int = 3) -> str:

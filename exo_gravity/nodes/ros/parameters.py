@@ -1,28 +1,22 @@
 # Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
-"""A node's own parameters, declared from a table of `core`, and those of another node, read over its services."""
+"""A node's own parameters, declared from a table of `core`."""
 
-import math
 import os
 import sys
-import time
-from collections.abc import Callable, Collection, Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any, TypeVar
 
 import yaml
 from rcl_interfaces.msg import FloatingPointRange, IntegerRange, ParameterDescriptor, SetParametersResult
-from rcl_interfaces.srv import GetParameters, ListParameters
 from rclpy.node import Node
-from rclpy.parameter import Parameter, parameter_value_to_python
-from rclpy.task import Future
+from rclpy.parameter import Parameter
 
 from exo_gravity.core.errors import ParameterError
 from exo_gravity.core.motors.joint_motor import OPTIONS
 from exo_gravity.core.params import ROS_PARAMETERS, Param, table_for, values_of
 
 T = TypeVar("T")
-
-RESPONSE_TIMEOUT = 5.0  # s after which a request to a node that has died is repeated
 
 
 def declare(node: Node, table: Sequence[Param], free_prefix: str = "") -> dict[str, Any]:
@@ -131,97 +125,3 @@ def descriptor_of(param: Param) -> ParameterDescriptor:
 def plain(value: Any) -> Any:
     """Return a parameter's value with arrays as lists."""
     return list(value) if isinstance(value, list | tuple) or hasattr(value, "tolist") else value
-
-
-class NodeParameters:
-    """The parameters of another node, read over its services.
-
-    name: its full name, or its name in `node`'s namespace.
-    on_read(name, values): called on the executor's thread each time that they were read.
-    once: whether they are read only once; the executor then no longer waits for the clients.
-    fitting(name, values): what is kept of them.
-
-    values: by name; {} until they are known.
-    is_present: whether the node has its services. One that has died can stay in ROS's list of names.
-    """
-
-    def __init__(
-        self,
-        node: Node,
-        name: str,
-        on_read: Callable[[str, dict[str, Any]], object] = lambda name, values: None,
-        once: bool = False,
-        fitting: Callable[[str, dict[str, Any]], dict[str, Any]] = lambda name, values: values,
-    ) -> None:
-        self.values: dict[str, Any] = {}
-        self.is_present = False
-        self._node, self._name = node, name
-        self._on_read, self._once, self._fitting = on_read, once, fitting
-        self._get = node.create_client(GetParameters, f"{name}/get_parameters")
-        self._list = node.create_client(ListParameters, f"{name}/list_parameters")
-        self._due = -math.inf  # s, when to ask; infinite while the values are known
-        self._is_done = False
-
-    def refresh(self) -> None:
-        """Read the parameters again, at the next `update`."""
-        self._due = -math.inf
-
-    def update(self) -> None:
-        """Read the parameters if they may have changed and the node answers. Call it on the executor's thread."""
-        if self._is_done:
-            return
-        self.is_present = self._get.service_is_ready() and self._list.service_is_ready()
-        now = time.monotonic()
-        if not self.is_present:
-            self._due = -math.inf  # it may return with other values
-        elif now >= self._due:
-            self._due = now + RESPONSE_TIMEOUT
-            self._list.call_async(ListParameters.Request()).add_done_callback(self._on_names)
-
-    def _on_names(self, listed: Future) -> None:
-        if not self._is_done:
-            names = listed.result().result.names
-            asked = self._get.call_async(GetParameters.Request(names=names))
-            asked.add_done_callback(lambda done: self._on_values(names, done))
-
-    def _on_values(self, names: Sequence[str], asked: Future) -> None:
-        if self._is_done:
-            return
-        if math.isfinite(self._due):  # else they have changed since
-            self._due = math.inf
-        values = map(parameter_value_to_python, asked.result().values)
-        known = {name: plain(value) for name, value in zip(names, values, strict=False) if value is not None}
-        self.values = self._fitting(self._name, known)
-        if self._once:
-            self._is_done = True
-            self._node.destroy_client(self._get)
-            self._node.destroy_client(self._list)
-        self._on_read(self._name, self.values)
-
-
-class OtherNodes:
-    """The other nodes in this ROS domain, with their parameters.
-
-    leaves: the last parts of the names that are looked for; () for all.
-    options: of each NodeParameters.
-
-    found: the nodes by full name; one that has ended stays.
-    """
-
-    def __init__(self, node: Node, leaves: Collection[str] = (), **options: Any) -> None:
-        self.found: dict[str, NodeParameters] = {}
-        self._node, self._leaves, self._options = node, leaves, options
-
-    def update(self) -> None:
-        """Find new nodes, and read parameters that may have changed. Call it on the executor's thread."""
-        for leaf, namespace in self._node.get_node_names_and_namespaces():
-            name = f"{namespace.rstrip('/')}/{leaf}"
-            is_wanted = leaf in self._leaves if self._leaves else not leaf.startswith("_")
-            if is_wanted and name not in self.found and name != self._node.get_fully_qualified_name():
-                self.found[name] = NodeParameters(self._node, name, **self._options)
-        for parameters in self.found.values():
-            parameters.update()
-
-    def values(self, name: str) -> dict[str, Any]:
-        """Return the newest parameters of a node; {} while they are not known."""
-        return self.found[name].values if name in self.found else {}

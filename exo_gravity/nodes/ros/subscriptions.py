@@ -118,24 +118,6 @@ class PolledSubscription(PeriodicThread):
             self._callback(*item)
 
 
-class Latest:
-    """The newest message of `topic`, or what `use` makes of it. The topic is polled only in `within`."""
-
-    def __init__(
-        self, node: Node, msgtype: type, topic: str, use: Callable[[Any], Any] = lambda message: message
-    ) -> None:
-        self._use, self._content, self._arrived = use, None, -math.inf
-        self._subscription = PolledSubscription(node, msgtype, topic, self._on_message)
-
-    def within(self, timeout: float) -> Any:
-        """Return it; None if it is older than `timeout` s."""
-        self._subscription.poll()
-        return self._content if time.monotonic() - self._arrived < timeout else None
-
-    def _on_message(self, message: Any, _info: dict[str, Any]) -> None:
-        self._content, self._arrived = self._use(message), time.monotonic()
-
-
 class Publishers:
     """Tells the publishers of one topic apart. Each numbers its messages from 1, and rclpy passes the numbers on.
 

@@ -14,7 +14,8 @@ from rclpy.signals import SignalHandlerOptions
 from std_srvs.srv import Trigger
 
 from exo_gravity.hardware.network import keep_to_this_machine
-from exo_gravity.nodes.ros.messages import NO_POSE, POSE_TO_CONFIRM, Statuses
+from exo_gravity.nodes.others import Statuses
+from exo_gravity.nodes.ros.messages import NO_POSE, POSE_TO_CONFIRM
 
 SILENT = 1.5  # s without diagnostics after which a question no longer stands
 ANSWER_TIMEOUT = 3.0  # s, longer than can_bridge itself waits

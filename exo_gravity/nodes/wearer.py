@@ -40,8 +40,9 @@ from exo_gravity.lab.inputs.arms import fitting
 from exo_gravity.lab.observer.share import PERIOD
 from exo_gravity.lab.observer.watch import WearerWatch, values_of
 from exo_gravity.lab.vocabulary import Adapts, Budget, NoEstimate, WearerState
-from exo_gravity.nodes.ros.messages import OK, STALE, WARN, Diagnostics, Statuses, by_name
-from exo_gravity.nodes.ros.parameters import NodeParameters, declare
+from exo_gravity.nodes.others import NodeParameters, Statuses
+from exo_gravity.nodes.ros.messages import OK, STALE, WARN, Diagnostics, by_name
+from exo_gravity.nodes.ros.parameters import declare
 from exo_gravity.nodes.ros.run import run
 from exo_gravity.nodes.ros.subscriptions import LATCHED, PeriodicThread, PolledSubscription, TiltSubscription
 

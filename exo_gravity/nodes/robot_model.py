@@ -42,10 +42,11 @@ from exo_gravity.lab.view import (
     urdf,
 )
 from exo_gravity.lab.vocabulary import NodeState
-from exo_gravity.nodes.ros.messages import OK, WARN, Diagnostics, Statuses, by_name, to_nanoseconds
-from exo_gravity.nodes.ros.parameters import OtherNodes, declare
+from exo_gravity.nodes.others import Latest, OtherNodes, Statuses
+from exo_gravity.nodes.ros.messages import OK, WARN, Diagnostics, by_name, to_nanoseconds
+from exo_gravity.nodes.ros.parameters import declare
 from exo_gravity.nodes.ros.run import run
-from exo_gravity.nodes.ros.subscriptions import LATCHED, PITCH_YAW, Latest
+from exo_gravity.nodes.ros.subscriptions import LATCHED, PITCH_YAW
 
 COMPENSATOR, BRIDGE = "compensator", "can_bridge"  # the nodes of an arm
 

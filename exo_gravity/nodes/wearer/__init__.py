@@ -1,1 +1,0 @@
-# Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
