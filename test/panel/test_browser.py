@@ -435,10 +435,25 @@ def test_a_second_page_watches_lets_down_and_takes_control_and_no_page_shows_an_
 def test_a_subject_is_chosen_with_its_wearer_and_the_past_sessions_have_their_reports(visit, stage, tmp_path):
     report, name = tmp_path / "report.html", "P01/2026-03-14/demo_20260314_120000"
     report.write_text("<h1>demo of P01</h1>")
-    entry = {"subject": "P01", "trial": "demo", "when": "2026-03-14 12:00:00", "report": name}
-    stage.files.recorded, stage.files.reports, stage.files.wearers = [entry], {name: report}, {"P01": WEARER_FILE}
+    entry = {"subject": "P01", "trial": "demo", "when": "2026-03-14 12:00:00", "report": name, "folder": name}
+    entry |= {"protocol": "reaching", "seconds": 61.5, "verdict": "It held."}
+    other = {**entry, "subject": "P02", "report": "", "folder": "", "seconds": None, "verdict": ""}
+    stage.files.recorded, stage.files.reports, stage.files.wearers = (
+        [entry, other],
+        {name: report},
+        {"P01": WEARER_FILE},
+    )
     page = visit()
-    assert page.inner_text("#past tr").split("\t")[:3] == ["2026-03-14 12:00:00", "P01", "demo"]
+    shown = ["2026-03-14 12:00:00", "P01", "demo", "reaching", "62 s", "It held."]
+    assert page.inner_text("#past tr").split("\t")[:6] == shown
+    assert page.locator("#past tr").count() == 2
+    page.fill("#past-filter", "p01 reach")
+    assert page.locator("#past tr:visible").count() == 1
+    (tmp_path / "bag").mkdir()
+    (tmp_path / "bag" / "bag.mcap").write_bytes(b"MCAP")
+    with page.expect_download() as download:
+        page.click("#past a:text('MCAP')")
+    assert download.value.suggested_filename == "demo_20260314_120000.mcap"
     with page.context.expect_page() as opened:
         page.click("#past a")
     assert opened.value.inner_text("h1") == "demo of P01"
