@@ -248,7 +248,7 @@ class Session {
         for (const text of texts) row.insertCell().textContent = text;
         const links = row.insertCell();
         const add = (kind, name, text) => links.append(Object.assign(document.createElement("a"), { href: fileAt(kind, name), target: "_blank", rel: "noopener", textContent: text }), " ");
-        if (entry.report) add("report", entry.report, t("trial_report"));
+        if (entry.report) add("report", entry.report, t("past_report"));
         if (entry.folder) add("recording", entry.folder, "MCAP");
         return row;
       }),
