@@ -14,6 +14,7 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from mpl_toolkits.mplot3d.axes3d import Axes3D
 from mpl_toolkits.mplot3d.proj3d import proj_transform
+from PIL import Image
 from rich.console import Console
 from rich.progress import track
 
@@ -29,6 +30,7 @@ from exo_gravity.lab.trial.recording import Recording
 from exo_gravity.lab.view import COLOURS, LINE, SPHERE, ArmView, Described, arm_shapes, described
 
 SIZE, GIF_SIZE, DPI = (6.4, 4.8), (4.8, 3.6), 100  # inches
+COLOURS_OF_A_GIF = 64  # few keep it small
 INK, LEADER = "#282c34", "#969ca4"
 NO_TORQUE = 0.05  # Nm, below which a motor is off
 STEPS = {"move": "the wearer moves the arm", "hold": "hands off", "push": "a push"}
@@ -62,8 +64,9 @@ def write_clip(bag: Bag, path: Path, step: float, frame_rate: int, console: Cons
     try:
         stage = Stage(bag, GIF_SIZE if is_gif else SIZE)
         if is_gif:
-            pictures = [stage.picture(time) for time in drawn]
-            iio.imwrite(path, pictures, plugin="pillow", duration=round(1000 / frame_rate), loop=0)  # ms
+            pictures = (Image.fromarray(stage.picture(time)) for time in drawn)
+            drawings = (picture.quantize(COLOURS_OF_A_GIF, dither=Image.Dither.NONE) for picture in pictures)
+            next(drawings).save(path, save_all=True, append_images=drawings, duration=round(1000 / frame_rate), loop=0)
             return
         with iio.imopen(path, "w", plugin="pyav") as file:
             file.init_video_stream("libx264", fps=frame_rate)
