@@ -30,7 +30,6 @@ from exo_gravity.lab.trial.recording import Recording
 from exo_gravity.lab.view import COLOURS, LINE, SPHERE, ArmView, Described, arm_shapes, described
 
 SIZE, GIF_SIZE, DPI = (6.4, 4.8), (4.8, 3.6), 100  # inches
-COLOURS_OF_A_GIF = 64  # few keep it small
 INK, LEADER = "#282c34", "#969ca4"
 NO_TORQUE = 0.05  # Nm, below which a motor is off
 STEPS = {"move": "the wearer moves the arm", "hold": "hands off", "push": "a push"}
@@ -64,8 +63,8 @@ def write_clip(bag: Bag, path: Path, step: float, frame_rate: int, console: Cons
     try:
         stage = Stage(bag, GIF_SIZE if is_gif else SIZE)
         if is_gif:
-            pictures = (Image.fromarray(stage.picture(time)) for time in drawn)
-            drawings = (picture.quantize(COLOURS_OF_A_GIF, dither=Image.Dither.NONE) for picture in pictures)
+            # Few colours keep it small.
+            drawings = (Image.fromarray(stage.picture(t)).quantize(64, dither=Image.Dither.NONE) for t in drawn)
             next(drawings).save(path, save_all=True, append_images=drawings, duration=round(1000 / frame_rate), loop=0)
             return
         with iio.imopen(path, "w", plugin="pyav") as file:
