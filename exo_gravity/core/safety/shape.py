@@ -71,11 +71,12 @@ class StillnessTuning:
 
     speed: float = 1.0  #: rad/s, at which the damping then balances the torque
     still: float = 0.1  #: rad/s; four codes of the velocity
+    turn: float = 0.01  #: rad by which a joint may turn and be still: an arm may creep, at 0.05 rad/s
     time: float = 0.2  #: s for which a joint is still, before it is damped
     release: float = 0.04  #: s, time constant with which a joint that moves off is let go
     #: rad/s beyond the low-passed speed, as no wearer moves off: 0.18 in a reach at 3 rad/s, an empty forearm 1 to 2
     sudden: float = 0.3
-    least: float = 0.5  #: Nm; less throws no joint
+    least: float = 0.5  #: Nm; less throws no joint, and a light one that leaves its friction needs no more
     share: float = 0.5  #: of the damping; a joint with less of it has moved before
     wearer: float = 1.5  #: of the torque, beyond which the damping shows that someone moves the joint
     empty: float = 0.2  #: s for which the damping balances the torque: there is no arm in the cuff
@@ -110,6 +111,7 @@ class JointShaper:
         self._brake = self._given = 0.0  # Nm s/rad, and all that was given last
         self._steady = math.inf  # Nm s/rad, the most that the joint gets of what is asked for
         self._still_for = self._held = 0.0  # s, and Nm s/rad
+        self._still_at = math.nan  # rad
         # Whether it moves off as no wearer does, its motor drives it, and someone moves it.
         self.is_sudden = self.is_driven = self.is_moved = False
         self._way = 1.0  # 1 or -1, in which it was last faster than VIBRATION.speed
@@ -149,13 +151,14 @@ class JointShaper:
             "max_effort_rate": given != clamped,
         }
         acted.update([f"{name} ({self._name})" for name, acts in limiting.items() if acts])
-        return given, max(self._slowly, wall, pause, self._hold(dt, sample.velocity, given, is_empty))
+        return given, max(self._slowly, wall, pause, self._hold(dt, sample, given, is_empty))
 
-    def _hold(self, dt: float, velocity: float, effort: float, is_empty: bool) -> float:
+    def _hold(self, dt: float, sample: JointSample, effort: float, is_empty: bool) -> float:
         """Return the damping in Nm s/rad of a joint that is still, or whose arm seems to be empty.
 
         effort: Nm, which the motor applies. is_empty: whether what the arm carried seems to have left it.
         """
+        velocity = sample.velocity
         along, before = (math.copysign(speed, speed * effort) for speed in (velocity, self._slow))
         full = min(self._peak, abs(effort) / STILLNESS.speed)
         is_held = abs(effort) >= STILLNESS.least and self._held >= STILLNESS.share * full
@@ -163,9 +166,14 @@ class JointShaper:
         self.is_sudden = is_held and along - before > STILLNESS.sudden
         self.is_moved = not -STILLNESS.share <= share <= STILLNESS.wearer
         self.is_driven = share > 0.0 and along > STILLNESS.still
-        self._still_for = self._still_for + dt if abs(velocity) <= STILLNESS.still else 0.0
-        if is_empty or self._still_for >= STILLNESS.time:
-            self._held = limited(full, self._held, DAMPING_RATE * dt)
+        is_still = abs(velocity) <= STILLNESS.still and abs(sample.position - self._still_at) <= STILLNESS.turn
+        self._still_for = self._still_for + dt if is_still else 0.0
+        self._still_at = self._still_at if is_still else sample.position
+        if is_empty:
+            self._held = full
+        elif self._still_for >= STILLNESS.time:
+            heavy = max(0.0, min(1.0, abs(effort) / STILLNESS.least - 1.0))
+            self._held = limited(heavy * full, self._held, DAMPING_RATE * dt)
         elif not self._still_for:
             self._held *= max(0.0, 1.0 - dt / STILLNESS.release)
         return self._held
