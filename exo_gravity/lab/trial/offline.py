@@ -16,6 +16,7 @@ from pathlib import Path
 import numpy as np
 import yaml
 from rich.console import Console
+from rich.progress import Progress, TaskID
 
 from exo_gravity.core.compensation.compensator import Compensator
 from exo_gravity.core.compensation.settings import Settings
@@ -215,8 +216,16 @@ def record_offline(trial: Trial, console: Console, should_stop: Callable[[], boo
     assert trial.params is not None, "arms that are carried already are not simulated here"
     simulated = simulated_trials(trial.params, trial.script)
     nodes = load(trial.prepare(with_recorder=False))
-    with console.status("simulating"):
-        recordings = [one.run(lambda now: should_stop()) for one in simulated]
+    recordings = []
+    with Progress(console=console, transient=True, disable=not console.is_terminal) as progress:
+        for one in simulated:
+            task = progress.add_task(one.arm.name, total=one.script.duration)
+
+            def on_second(now: float, task: TaskID = task) -> bool:
+                progress.update(task, completed=now)
+                return should_stop()
+
+            recordings.append(one.run(on_second))
     events = sorted((event for one in simulated for event in one.events), key=lambda event: event.time)
     texts = {
         node: yaml.safe_dump({node: {"ros__parameters": values}}, default_flow_style=None, width=120)

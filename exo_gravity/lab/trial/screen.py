@@ -1,5 +1,5 @@
 # Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
-"""The screen of a running trial: the current step, the time left, and angles and torques of each arm.
+"""The screen of a running trial: the current step, the time left, and angles, torques and drift of each arm.
 
 It reads the lines of JSON that `recorder` prints ten times a second. If a simulator performs the script, its steps are
 in those lines. At a real arm a clock leads the person through the script.
@@ -19,6 +19,7 @@ from exo_gravity.core.safety.drive import State
 from exo_gravity.core.vocabulary import NONE
 from exo_gravity.sim.script import Step, TrialScript
 
+SETTLING = 0.5  # s between letting go and the position from which drift is measured
 LEAD = 5.0  # s for a person to get ready when the arm is carried
 BRIDGE_TIMEOUT = 5.0  # s from the recorder's first line, in which a bridge that runs already has reported ten times
 
@@ -53,6 +54,7 @@ class TrialScreen:
         self._step_start = self._last_line = self.clock()
         self._first_line = math.inf
         self._start = math.inf  # of a script that the clock leads
+        self._origin: dict[str, list[float]] = {}  # position of each arm from which drift is measured
         self._ending = ""
         #: shows `screen` on a terminal, and nothing elsewhere
         self.live = Live(
@@ -136,14 +138,27 @@ class TrialScreen:
         elif now >= self._start:
             index = self.script.at(now - self._start)[0]
         if index != self._index:
-            self._index, self._step_start = index, now
+            if self._origin:
+                self.console.print(f"     drifted {self._drift():.2f} deg")
+            self._index, self._step_start, self._origin = index, now, {}
             if self._step:
                 number = f"{index + 1}/{len(self.script.steps)}"
                 self.console.print(f"{number:<5}{describe(self._step, self.guided)}", soft_wrap=True)
+        elif not self._origin and now - self._step_start > SETTLING and self._step and self._step.action == "hold":
+            self._origin = {name: arm["position"] for name, arm in self._arms.items()}
         self.done = index >= len(self.script.steps)
 
+    def _drift(self) -> float:
+        """Return the largest drift of any joint since it was let go, in degrees."""
+        moved = (
+            abs(now - then)
+            for name, origin in self._origin.items()
+            for now, then in zip(self._arms.get(name, {"position": origin})["position"], origin, strict=True)
+        )
+        return math.degrees(max(moved, default=0.0))
+
     def screen(self) -> Group:
-        """Return the changing part of the screen: time left, next step, each arm, warnings and errors."""
+        """Return the changing part of the screen: time left, drift, next step, each arm, warnings and errors."""
         lines = [Text(self._headline(), style="bold")]
         for name, arm in self._arms.items():
             angles = " ".join(f"{math.degrees(angle):6.1f}" for angle in arm["position"])
@@ -158,7 +173,8 @@ class TrialScreen:
             return ""
         if self._index >= 0:
             then = describe(steps[self._index + 1], self.guided) if self._index + 1 < len(steps) else "done"
-            return f"     {self._left:.0f} s left    then: {then}"
+            drift = f"drift {self._drift():.2f} deg    " if self._origin else ""
+            return f"     {self._left:.0f} s left    {drift}then: {then}"
         if self._start < math.inf:
             first = describe(steps[0], self.guided)
             return f"     take hold of the arm: in {self._left:.0f} s, {first}"
