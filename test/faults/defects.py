@@ -73,11 +73,6 @@ def returns(result: Any) -> Callable[[Any], Any]:
     return lambda _: lambda *args, **options: result
 
 
-def becomes(value: Any) -> Callable[[Any], Any]:
-    """Have this value."""
-    return lambda _: value
-
-
 def tuned(**fields: float) -> Callable[[Any], Any]:
     """Have these values in a record of tuning."""
     return lambda record: replace(record, **fields)

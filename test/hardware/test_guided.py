@@ -28,7 +28,6 @@ from ..support.thorough import quick
 from .arms import PEAK, RATE, RATED, CarriedArm, raised_usual_arm, usual_arm
 
 SAFE_SPEED = 0.65  # rad/s, at which an arm without friction sinks under the damping of the motors
-CODE = 0.009  # Nm, of a torque of the AK80-9 on the wire
 RAISED = (0.0, 1.2, 0.3, 0.3)  # rad
 ONE_G = {"mode": "one_g"}
 SPRING = {"terms": TermSettings(spring=Spring((4.0, 14.0, 7.0, 3.9), (0.0, 0.0, -0.3, 1.3)))}

@@ -471,8 +471,6 @@ def test_inertia_and_momentum_agree_with_mujocos_and_their_balance_holds() -> No
 
 # Torque that gravity cannot account for.
 
-CYCLE = 0.004
-
 
 def limits_of(arm: UrdfArm, **changes: object) -> Limits:
     """What `budget` prints for the arm."""
