@@ -271,6 +271,7 @@ class Arm(CompensatorRun):
 def raised() -> Arm:
     """Return an arm that carries 70 % on request."""
     arm = Arm()
+    assert arm.report == "none"
     arm.asked = 0.7
     assert arm.run(4.0) == 0.7 and arm.report == "70 %"
     return arm

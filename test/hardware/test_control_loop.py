@@ -202,6 +202,12 @@ def test_the_thread_runs_the_cycles_until_the_loop_is_stopped():
     assert not loop.cycle()
 
 
+def test_our_own_frames_are_never_foreign():
+    arm = raised(echoes=True)
+    arm.run(1.0)
+    assert arm.bus.foreign_commands == 0 and "echo" in arm.bus.ignored and arm.state is State.ACTIVE
+
+
 # An arm whose motors are on two buses: one safety unit.
 
 FORMATS = pytest.mark.parametrize("wire_format", quick([MIT], [MIT, MIT_V3]), ids=["mit", "mit_v3"])
