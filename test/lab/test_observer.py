@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 
 from exo_gravity.core import ArmModel, Tilt, gravity_torque
-from exo_gravity.core.arm.interface import Payload
 from exo_gravity.core.arm.tilt import turning_in_base
 from exo_gravity.core.arm.wearer import Wearer
 from exo_gravity.core.compensation.settings import ModelError, Settings
@@ -160,21 +159,6 @@ def test_each_error_of_the_model_widens_the_band():
         assert np.all(np.array(wider.deviation) >= narrow) and wider.deviation[1] > 1.05 * narrow[1], name
 
 
-def test_the_band_holds_what_links_that_lie_elsewhere_make_of_gravity():
-    off, rng = 0.05, np.random.default_rng(4)  # rad
-    smooth = TermSettings(friction=Friction(0.0, (1e-6,) * 4))
-    settings = replace(SETTINGS, terms=smooth, model_error=replace(EXACT, deflection=(off,) * 4))
-    poses = rng.uniform((-0.6, 0.1, -0.2, 0.1), (0.8, 1.4, 1.2, 1.5), (80, 4))
-    found = []
-    for pose in poses:
-        links = pose + rng.normal(0.0, off, 4)
-        estimate = still(gravity_torque(WHOLE, links, TILT.direction), settings=settings, pose=pose)
-        found.append((estimate.torque, estimate.deviation))
-    error, deviation = np.moveaxis(np.array(found), 1, 0)
-    assert np.all(np.mean(np.abs(error) < COVER * deviation, axis=0) > 0.9)
-    assert np.all(rms(deviation) < 1.5 * rms(error) + 0.1)
-
-
 def elastic(seconds):
     """Yield time, joints as motors of 12 bits report them, and the wearer's torque, of a MuJoCo arm with soft joints.
 
@@ -293,12 +277,6 @@ def test_a_watch_tells_torques_beyond_their_band_the_share_and_nothing_that_is_o
     assert watch.values(4.0)["b wearer (Nm)"] == watched()[0]["b wearer (Nm)"] == "unknown"
     carried = watched(effort=needed.tolist())[0]
     assert abs(float(carried["b wearer (Nm)"])) < float(carried["b wearer band (Nm)"])
-
-
-def test_a_watch_follows_the_load_in_the_settings():
-    loaded = replace(SETTINGS, payload=Payload(1.0))
-    needed = gravity_torque(loaded.loaded.with_wearer(LOAD.mass, LOAD.cog), POSE, TILT.direction)
-    assert watched(loaded, needed.tolist())[1].torque == pytest.approx(STILL, abs=1e-9)
 
 
 def test_friction_that_grows_with_the_torque_is_not_taken_for_the_wearers():

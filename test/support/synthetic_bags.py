@@ -137,13 +137,9 @@ def joint_state(
     return serialised(JOINT_STATE, header(stamp, frame), list(names), *fields)
 
 
-def string(text: str) -> bytes:
-    return serialised(STRING, text)
-
-
 def text_entry(topic: str, seconds: float, text: str) -> Entry:
     """Return a std_msgs/String that arrives `seconds` s after START."""
-    return topic, STRING, START + round(seconds * 1e9), string(text)
+    return topic, STRING, START + round(seconds * 1e9), serialised(STRING, text)
 
 
 def status(seconds: float, text: str, level: int = 0, **values: str) -> Entry:
@@ -174,7 +170,7 @@ def messages(recording: Recording, command_names: Sequence[str] | None = None, s
         while script and steps and steps[0][0] <= stamp:
             at, index, step = steps.pop(0)
             content = {"step": index, "action": step.action, "duration": step.end - step.start}
-            yield f"{prefix}/wearer_step", STRING, at, string(json.dumps(content))
+            yield f"{prefix}/wearer_step", STRING, at, serialised(STRING, json.dumps(content))
         arrays = (recording.position[k], recording.velocity[k], recording.effort[k])
         state = joint_state(stamp, recording.joint_names, *arrays)
         yield f"{prefix}/joint_states", JOINT_STATE, stamp + 200_000, state

@@ -142,7 +142,11 @@ MIDDLEWARE = [  # the implementation, how far it reaches, what has opened it, an
 
 
 @pytest.mark.parametrize(("middleware", "reach", "opening", "level"), MIDDLEWARE)
-def test_the_middleware_and_who_may_command_the_arm(middleware: str, reach: str, opening: str, level: Level):
+def test_the_middleware_who_may_command_the_arm_and_the_multicast_of_the_simulated_bus(
+    middleware: str, reach: str, opening: str, level: Level, monkeypatch
+):
+    monkeypatch.setattr(settings, "GROUP", "10.0.0.1")  # no multicast address: refused
+    assert settings.of_multicast(True).level is Level.FAULT and settings.of_multicast(False).level is Level.FINE
     assert max(row.level for row in settings.of_middleware(middleware, reach, opening)) is level
 
 
@@ -164,11 +168,6 @@ def test_an_environment_that_would_end_every_node_is_refused_before_one_starts(
     monkeypatch.setenv(variable, value)
     code, _, err = run_tool(tool)
     assert code == 2 and said in err
-
-
-def test_multicast_is_needed_by_the_simulated_bus_alone(monkeypatch):
-    monkeypatch.setattr(settings, "GROUP", "10.0.0.1")  # no multicast address: refused
-    assert settings.of_multicast(True).level is Level.FAULT and settings.of_multicast(False).level is Level.FINE
 
 
 @pytest.mark.parametrize(("rate", "level"), [(250, Level.FINE), (900, Level.WARNING), (1100, Level.FAULT)])
