@@ -290,7 +290,9 @@ def test_time_is_that_of_the_stamps_from_the_first_arrival_on_and_without_stamps
     assert arm.carried is None  # no state was reported
     assert [step.action for step in arm.steps] == ["move", "hold", "move", "hold"]
     np.testing.assert_allclose([step.start for step in arm.steps], [step.start for step in TRIAL.steps], atol=0.02)
-    states = [("/joint_states", *rest, unstamped(data)) for _, *rest, data in poses(lambda _, pose: pose)]
+    states = [
+        ("/joint_states", *rest, restamped(data, lambda stamp: 0)) for _, *rest, data in poses(lambda _, pose: pose)
+    ]
     (arm,) = read(tmp_path / "arrival", states).recordings
     np.testing.assert_allclose(arm.time, TRIAL.time, atol=1e-8)
     assert arm.name == "arm"
@@ -302,10 +304,6 @@ def restamped(data: bytes, change: Callable[[int], int]) -> bytes:
     then = change(message.header.stamp.sec * SECOND + message.header.stamp.nanosec)
     message.header.stamp.sec, message.header.stamp.nanosec = divmod(then, SECOND)
     return bytes(made.STORE.serialize_cdr(message, made.JOINT_STATE))
-
-
-def unstamped(data: bytes) -> bytes:
-    return restamped(data, lambda stamp: 0)
 
 
 def with_clock(shift: int) -> Entries:
@@ -592,13 +590,8 @@ def test_numbers_and_texts_are_those_that_rosbags_decodes_and_a_damaged_message_
 # Events and parameters
 
 
-@pytest.fixture(scope="module")
-def content():
-    return list(made.messages(made.trial(made.POSES, hold=2.0, rate=200.0)))
-
-
-def read_of(content, folder, *more, until=np.inf):
-    kept = [item for item in (*content, *more) if item[2] < made.START + until * 1e9]
+def read_of(folder, *more, until=np.inf):
+    kept = [item for item in (*MESSAGES, *more) if item[2] < made.START + until * 1e9]
     return read_bag(made.write_bag(folder / "bag", kept))
 
 
@@ -607,9 +600,9 @@ def states(*names, first=0.1, period=0.5):
     return [made.status(first + number * period, name, state=name) for number, name in enumerate(names) if name]
 
 
-def test_an_arm_is_carried_from_the_first_to_the_last_carrying_state(content, tmp_path):
+def test_an_arm_is_carried_from_the_first_to_the_last_carrying_state(tmp_path):
     names = ["checking", "ramping in", "active", "active", "letting down", "fault", "checking", "active", "active"]
-    (arm,) = read_of(content, tmp_path, *states(*names, first=0.0, period=0.1)).recordings
+    (arm,) = read_of(tmp_path, *states(*names, first=0.0, period=0.1)).recordings
     arrival = 0.0002  # s, of the first joint state, at which time begins
     np.testing.assert_allclose(arm.carried, [(0.1 - arrival, 0.3 - arrival), (0.7 - arrival, 0.8 - arrival)], atol=1e-9)
 
@@ -623,8 +616,8 @@ def test_an_arm_is_carried_from_the_first_to_the_last_carrying_state(content, tm
         *((["active"] * 8 + [last], 0) for last in ("disabled", "fault")),
     ],
 )
-def test_a_recording_that_ends_before_the_arm_is_down_says_so(content, tmp_path, names, notes):
-    found = read_of(content, tmp_path, *states(*names), until=4.35)
+def test_a_recording_that_ends_before_the_arm_is_down_says_so(tmp_path, names, notes):
+    found = read_of(tmp_path, *states(*names), until=4.35)
     assert len(found.notes) == notes and all(note.startswith("right: the recording ends") for note in found.notes)
     if len(names) == 20:
         (arm,) = found.recordings
@@ -641,12 +634,12 @@ def parameter_event(seconds, name, number):
     return "/parameter_events", kind, made.START + round(seconds * 1e9), data
 
 
-def test_faults_changed_parameters_and_parameters_at_the_start_are_read(content, tmp_path):
+def test_faults_changed_parameters_and_parameters_at_the_start_are_read(tmp_path):
     snapshot = "/right/compensator:\n  ros__parameters: {law: exact}\n"
     keys = {"fault": "motor_silent", "fault text": "elbow: no reply for 0.05 s"}
     silent = [made.status(seconds, "motor 2 is silent", level=2, **keys) for seconds in (3.0, 3.5)]
     found = read_of(
-        content, tmp_path, made.text_entry("/recorder/parameters", 1.0, snapshot), made.status(2.0, "fine"), *silent,
+        tmp_path, made.text_entry("/recorder/parameters", 1.0, snapshot), made.status(2.0, "fine"), *silent,
         made.status(4.0, "fine"), parameter_event(5.0, "support", 0.5),
     )  # fmt: skip
     assert [(round(event.time, 3), event.text) for event in found.events] == [
