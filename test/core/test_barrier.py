@@ -130,11 +130,11 @@ def test_the_speed_of_a_motor_that_does_not_reply_bounds_nothing():
 def test_a_clamped_joint_is_damped_while_it_sinks_and_free_while_it_is_lifted():
     asked = (3.0, 9.0, 2.0, 3.0)
     arm = barrier()
-    sinking = arm.shape(0.2, joints(velocity=-0.3), asked, WHOLE, asked, NOTHING)
+    sinking = arm.shape(0.2, joints(velocity=-0.3), asked, WHOLE, asked, is_guided=False)
     assert sinking[1] == pytest.approx((DAMPING, DAMPING, 0.0, DAMPING))
-    lifted = arm.shape(0.1, joints(velocity=0.3), asked, WHOLE, asked, NOTHING)
+    lifted = arm.shape(0.1, joints(velocity=0.3), asked, WHOLE, asked, is_guided=False)
     assert lifted[1] == pytest.approx((0.5 * DAMPING, 0.5 * DAMPING, 0.0, 0.5 * DAMPING))
-    hot = barrier().shape(0.2, joints(velocity=-0.3, temperature=80), asked, WHOLE, (1.0,) * 4, NOTHING)
+    hot = barrier().shape(0.2, joints(velocity=-0.3, temperature=80), asked, WHOLE, (1.0,) * 4, is_guided=False)
     assert min(hot[1]) == pytest.approx(DAMPING)
 
 
@@ -142,7 +142,7 @@ def test_a_wall_pushes_back_before_a_joint_limit():
     low, high = LIMITS.position_min[3], LIMITS.position_max[3]
     for position, sign in ((low + 0.05, 1), (high - 0.05, -1)):
         arm = barrier()
-        effort, damping = arm.shape(1.0, joints(position=position), NOTHING, WHOLE, NOTHING, NOTHING)
+        effort, damping = arm.shape(1.0, joints(position=position), NOTHING, WHOLE, NOTHING, is_guided=False)
         assert effort[3] == pytest.approx(sign * 1.25) and damping[3] == 5.0
         assert "soft wall (d)" in arm.acted
 

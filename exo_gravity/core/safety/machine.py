@@ -40,7 +40,7 @@ from exo_gravity.core.safety.drive import (
     StateEvent,
 )
 from exo_gravity.core.safety.explain import MotionMonitor, RideThrough
-from exo_gravity.core.safety.guidance import GuidedMotion, guide_damping
+from exo_gravity.core.safety.guidance import GuidedMotion
 from exo_gravity.core.safety.limits import CONFIRM, DAMPING, DAMPING_RATE, MAX_EFFORT_RATE, Limits
 from exo_gravity.core.safety.shape import STILLNESS, Shaper
 from exo_gravity.core.safety.start import (
@@ -360,11 +360,10 @@ class SafetyMachine:
                 self._on(StateEvent.RAMPED)
         is_guided = damped or self.state is State.RAMPING_IN
         share = [1.0 - left for left in self._rise.shares]
-        guided = [guide_damping(joint.velocity) if is_guided else 0.0 for joint in joints]
         late = DAMPING if self.ride.is_riding else 0.0
         sent = self._sent.effort
         torque, damping = self.shaper.shape(
-            self._dt, joints, effort, share, sent, guided, late, self.watch.pause_damping
+            self._dt, joints, effort, share, sent, is_guided, late, self.watch.pause_damping
         )
         self.acted.update(dict.fromkeys(self.shaper.acted, self._now))
         return self._powered(torque, damping, self._commands)

@@ -19,10 +19,11 @@ and 6.4 at 100 Hz. A wearer who lifts their arm feels nothing up to V; at F they
 
 What a joint carries may leave it at once: a strap opens, a tool falls. Within a cycle of 4 ms the loop knows nothing of
 it, and a light forearm gains 2 rad/s. So a joint that is still is damped, by |tau| / `STILLNESS.speed`: what its torque
-then drives alone gets no faster. A joint that moves off as people do is let go within a few cycles: reaches of 0.4 to
-12 s cost a wearer of 75 kg at most 0.1 Nm RMS a joint. If one moves off faster, the whole arm stays damped, until
-nothing drives it or someone moves it faster. After `STILLNESS.empty` the arm is let down. An empty arm in Zero-G
-reaches 1.4 rad/s with 1 J, at 100 to 500 Hz; without this 5.0 rad/s at 100 Hz, 2.6 at 250, and 6.8 J.
+then drives alone gets no faster. It is not while its torque is guided: too much of it would not show. One that moves
+off as people do is let go within a few cycles: reaches of 0.4 to 12 s cost a wearer of 75 kg at most 0.1 Nm RMS. If one
+moves off faster, the whole arm stays damped, until nothing drives it or someone moves it faster. After
+`STILLNESS.empty` the arm is let down. An empty arm in Zero-G reaches 1.4 rad/s with 1 J, at 100 to 500 Hz; without this
+5.0 rad/s at 100 Hz, 2.6 at 250, and 6.8 J.
 
 A motor that is late with its replies may have lost its power. Its joint falls, and the torque of the others, which
 answers the pose before, drives them. Meanwhile V is BARRIER.calm and F is BARRIER.still for all joints. This brake ends
@@ -47,6 +48,7 @@ from dataclasses import dataclass
 from exo_gravity.core.errors import ParameterError
 from exo_gravity.core.motors.joint_motor import JointSample
 from exo_gravity.core.numbers import limited
+from exo_gravity.core.safety.guidance import guide_damping
 from exo_gravity.core.safety.limits import DAMPING, DAMPING_RATE, HEAT, MAX_EFFORT_RATE, WALL, Limits
 
 
@@ -71,8 +73,8 @@ class StillnessTuning:
 
     speed: float = 1.0  #: rad/s, at which the damping then balances the torque
     still: float = 0.1  #: rad/s; four codes of the velocity
-    turn: float = 0.01  #: rad by which a joint may turn and be still: an arm may creep, at 0.05 rad/s
-    time: float = 0.2  #: s for which a joint is still, before it is damped
+    turn: float = 0.002  #: rad by which a joint may turn and be still; five codes of the position
+    time: float = 0.2  #: s for which a joint is still, before it is damped: less than 0.01 rad/s
     release: float = 0.04  #: s, time constant with which a joint that moves off is let go
     #: rad/s beyond the low-passed speed, as no wearer moves off: 0.18 in a reach at 3 rad/s, an empty forearm 1 to 2
     sudden: float = 0.3
@@ -124,7 +126,7 @@ class JointShaper:
         effort: float,
         share: float,
         before: float,
-        guided: float,
+        is_guided: bool,
         late: float,
         pause: float,
         is_empty: bool,
@@ -143,6 +145,7 @@ class JointShaper:
         # The compensator may have clamped it already: all that is permitted counts as clamped.
         missing = given if abs(given) >= permitted else wanted - given
         withheld = DAMPING if missing * sample.velocity < 0.0 else 0.0
+        guided = guide_damping(sample.velocity) if is_guided else 0.0
         self._slowly = limited(max(guided, late, withheld), self._slowly, DAMPING_RATE * dt)
         limiting = {
             "soft wall": wall > 0.0,
@@ -151,12 +154,13 @@ class JointShaper:
             "max_effort_rate": given != clamped,
         }
         acted.update([f"{name} ({self._name})" for name, acts in limiting.items() if acts])
-        return given, max(self._slowly, wall, pause, self._hold(dt, sample, given, is_empty))
+        return given, max(self._slowly, wall, pause, self._hold(dt, sample, given, is_empty, is_guided))
 
-    def _hold(self, dt: float, sample: JointSample, effort: float, is_empty: bool) -> float:
+    def _hold(self, dt: float, sample: JointSample, effort: float, is_empty: bool, is_guided: bool) -> float:
         """Return the damping in Nm s/rad of a joint that is still, or whose arm seems to be empty.
 
-        effort: Nm, which the motor applies. is_empty: whether what the arm carried seems to have left it.
+        effort: Nm, which the motor applies. is_empty: whether what the arm carried seems to have left it. is_guided:
+        whether its torque is guided, which is to move a joint that has too much of it.
         """
         velocity = sample.velocity
         along, before = (math.copysign(speed, speed * effort) for speed in (velocity, self._slow))
@@ -166,7 +170,11 @@ class JointShaper:
         self.is_sudden = is_held and along - before > STILLNESS.sudden
         self.is_moved = not -STILLNESS.share <= share <= STILLNESS.wearer
         self.is_driven = share > 0.0 and along > STILLNESS.still
-        is_still = abs(velocity) <= STILLNESS.still and abs(sample.position - self._still_at) <= STILLNESS.turn
+        is_still = (
+            not is_guided
+            and abs(velocity) <= STILLNESS.still
+            and abs(sample.position - self._still_at) <= STILLNESS.turn
+        )
         self._still_for = self._still_for + dt if is_still else 0.0
         self._still_at = self._still_at if is_still else sample.position
         if is_empty:
@@ -236,7 +244,7 @@ class Shaper:
         effort: Sequence[float],
         share: Sequence[float],
         before: Sequence[float],
-        guided: Sequence[float],
+        is_guided: bool,
         late: float = 0.0,
         pause: float = 0.0,
     ) -> tuple[tuple[float, ...], tuple[float, ...]]:
@@ -246,15 +254,16 @@ class Shaper:
         effort: what is asked for, (n,) Nm.
         share: 0..1, the factor (n,) on effort and soft wall where torque begins.
         before: the torque of the last drive, (n,) Nm.
-        guided, late, pause: the damping that a guided motion (n,), late efforts and a pause ask for, Nm s/rad.
+        is_guided: whether the torque is guided.
+        late, pause: the damping that late efforts and a pause ask for, Nm s/rad.
 
         Raises ParameterError if an effort is NaN or beyond `max_command`.
         """
         self.acted = set()
-        columns = zip(self._joints, samples, effort, share, before, guided, strict=True)
+        columns = zip(self._joints, samples, effort, share, before, strict=True)
         given = [
-            joint.shape(dt, sample, asked, part, last, calm, late, pause, self.empty_for > 0.0, self.acted)
-            for joint, sample, asked, part, last, calm in columns
+            joint.shape(dt, sample, asked, part, last, is_guided, late, pause, self.empty_for > 0.0, self.acted)
+            for joint, sample, asked, part, last in columns
         ]
         is_empty = self.empty_for or any(joint.is_sudden for joint in self._joints)
         is_alone = any(joint.is_driven for joint in self._joints) and not any(joint.is_moved for joint in self._joints)
