@@ -162,8 +162,7 @@ class JointShaper:
         effort: Nm, which the motor applies. is_empty: whether what the arm carried seems to have left it. is_guided:
         whether its torque is guided, which is to move a joint that has too much of it.
         """
-        velocity = sample.velocity
-        along, before = (math.copysign(speed, speed * effort) for speed in (velocity, self._slow))
+        along, before = (math.copysign(speed, speed * effort) for speed in (sample.velocity, self._slow))
         full = min(self._peak, abs(effort) / STILLNESS.speed)
         is_held = abs(effort) >= STILLNESS.least and self._held >= STILLNESS.share * full
         share = self._held * along / abs(effort) if is_held else 0.0  # of the torque, that the damping balances
@@ -172,7 +171,7 @@ class JointShaper:
         self.is_driven = share > 0.0 and along > STILLNESS.still
         is_still = (
             not is_guided
-            and abs(velocity) <= STILLNESS.still
+            and abs(sample.velocity) <= STILLNESS.still
             and abs(sample.position - self._still_at) <= STILLNESS.turn
         )
         self._still_for = self._still_for + dt if is_still else 0.0
