@@ -66,8 +66,10 @@ def lasting_rules(rules_of):
 def nodes_with_recorded_parameters(bag):
     """Yield the nodes whose parameters are in a recording, which may still grow."""
     with suppress(DataError):  # while it is empty
-        for _, msgtype, _, data in Storage(bag).messages(lambda topic, _: topic == "/recorder/parameters"):
-            yield get_typestore(Stores.ROS2_JAZZY).deserialize_cdr(data, msgtype).data.partition(":")[0].strip()
+        for rows in Storage(bag).rows(lambda topic, _: topic == "/recorder/parameters"):
+            for data in rows.batch.messages():
+                message = get_typestore(Stores.ROS2_JAZZY).deserialize_cdr(data, "std_msgs/msg/String")
+                yield message.data.partition(":")[0].strip()
 
 
 @pytest.mark.thorough

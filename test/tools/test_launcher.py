@@ -37,14 +37,16 @@ def test_a_closed_terminal_stops_the_launcher_as_ctrl_c_does():
 
 def test_the_node_names_are_the_modules_with_an_entry_point_and_help_lists_them(run_tool):
     folder = ROOT / "exo_gravity" / "nodes"
-    files = [*folder.glob("*.py"), *folder.glob("*/node.py")]
-    with_main = [path for path in files if "\ndef main(" in path.read_text(encoding="utf-8")]
+    with_main = [
+        path
+        for path in (*folder.glob("*.py"), *folder.glob("*/node.py"))
+        if "\ndef main(" in path.read_text(encoding="utf-8")
+    ]
     modules = {path.parent.name if path.stem == "node" else path.stem for path in with_main}
     # The launcher runs pose_prompt on its own terminal: it is no node.
     assert {*node_modules(), "pose_prompt"} == modules >= {"can_bridge", "imu", "compensator", "simulator", "recorder"}
     code, out, _ = run_tool("launcher", "--help")
-    text = " ".join(out.split())
-    assert code == 0 and "/right/can_bridge" in text and ", ".join(node_modules()) in text
+    assert code == 0 and "/right/can_bridge" in out and ", ".join(node_modules()) in " ".join(out.split())
 
 
 def test_a_node_is_run_from_this_package_whatever_lies_in_the_folders(tmp_path, monkeypatch):
