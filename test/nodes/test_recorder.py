@@ -30,7 +30,7 @@ from exo_gravity.nodes.ros.messages import to_nanoseconds
 from exo_gravity.nodes.ros.subscriptions import LATCHED
 
 from ..support.node_thread import own_node
-from ..support.waiting import PATIENCE, wait_until
+from ..support.waiting import PATIENCE, pause, wait_until
 
 # silence in s: a busy machine sends late. grip_force: as CONTRIBUTING's "Add a topic" says.
 PROGRAM = """
@@ -90,33 +90,35 @@ class PublishingArm:
         self.executor.spin_once(timeout_sec=0.002)
 
 
-@pytest.fixture(scope="module")
+@pytest.fixture
 def arm():
     with own_node("bridge") as own:
         yield PublishingArm(*own)
 
 
 @pytest.fixture(scope="module")
-def session(arm, tmp_path_factory):
+def session(tmp_path_factory):
     """A complete recording: its folder, the lines of JSON, the exit code, and the type hash that DDS announces."""
     path = tmp_path_factory.mktemp("recorder") / "bag"
-    arm.send("wearer_step", String(data=json.dumps({"step": 0, "action": "hold", "duration": 9.0})))
-    of_whom = ("-p", "subject:=P01", "-p", "protocol:=pilot", "-p", "note:='second: visit'")
-    process = start(path, "-p", "live:=true", *of_whom)
-    arm.wait_until_recorded()
-    known = arm.node.get_publishers_info_by_topic("/right/joint_states")[0]
-    for k in range(COUNT):
-        arm.publish(k)
-    status = DiagnosticStatus(level=DiagnosticStatus.ERROR, name="right/bridge", message="motor 2 is silent")
-    arm.send("/event_marker", String(data="cramp"))
-    arm.send("grip_force", Float64(data=12.5))
-    arm.send("/diagnostics", DiagnosticArray(status=[status]))
-    arm.node.set_parameters([Parameter("support", value=0.5)])
-    lines = []
-    while not lines or (lines[-1] and "motor 2 is silent" not in lines[-1]):
-        lines.append(process.stdout.readline())
-    process.send_signal(signal.SIGINT)
-    process.communicate(timeout=PATIENCE)
+    with own_node("bridge") as own:
+        arm = PublishingArm(*own)
+        arm.send("wearer_step", String(data=json.dumps({"step": 0, "action": "hold", "duration": 9.0})))
+        of_whom = ("-p", "subject:=P01", "-p", "protocol:=pilot", "-p", "note:='second: visit'")
+        process = start(path, "-p", "live:=true", *of_whom)
+        arm.wait_until_recorded()
+        known = arm.node.get_publishers_info_by_topic("/right/joint_states")[0]
+        for k in range(COUNT):
+            arm.publish(k)
+        arm.send("/event_marker", String(data="cramp"))
+        arm.send("grip_force", Float64(data=12.5))
+        silent = {"name": "right/bridge", "message": "motor 2 is silent"}
+        arm.send("/diagnostics", DiagnosticArray(status=[DiagnosticStatus(level=DiagnosticStatus.ERROR, **silent)]))
+        arm.node.set_parameters([Parameter("support", value=0.5)])
+        lines = []
+        while not lines or (lines[-1] and "motor 2 is silent" not in lines[-1]):
+            lines.append(process.stdout.readline())
+        process.send_signal(signal.SIGINT)
+        process.communicate(timeout=PATIENCE)
     return path, lines, process.returncode, known.topic_type_hash
 
 
@@ -176,7 +178,7 @@ def test_a_full_disk_ends_the_recorder_with_the_reason_and_keeps_what_fits(arm, 
     # A compiled module that is cut would keep every later process of this environment from starting.
     process = start(tmp_path / "bag", preexec_fn=small, env={**os.environ, "PYTHONDONTWRITEBYTECODE": "1"})
     arm.wait_until_recorded()
-    wait_until(process.poll, partial(arm.publish, 1))
+    wait_until(process.poll, lambda: arm.publish(1) or pause())  # slowly enough for several chunks
     _, errors = process.communicate(timeout=PATIENCE)
     assert process.returncode == 1 and "recording ended after" in errors and "File too large" in errors
     assert len(read_bag(tmp_path / "bag").recordings[0].time) > 20  # all but what was in the last chunk

@@ -6,7 +6,6 @@ from pathlib import Path
 
 import pytest
 import yaml
-from rosbags.typesys import Stores, get_typestore
 
 from exo_gravity.lab.bag.reader import read_bag
 from exo_gravity.lab.bag.storage import Storage
@@ -14,6 +13,7 @@ from exo_gravity.lab.inputs.parameter_file import load
 
 from ..support.launched_nodes import LaunchedNodes
 from ..support.ros_probe import RosProbe
+from ..support.synthetic_bags import STORE
 
 pytest.importorskip("playwright", reason="no browser driver: install the extra test")
 
@@ -28,9 +28,11 @@ RECORDING = 50_000  # bytes of a file into which joint states are written
 
 
 def panel_diagnostics(bag: Path) -> list[str]:
-    types = get_typestore(Stores.ROS2_JAZZY)
-    messages = Storage(bag).messages(lambda topic, msgtype: topic == "/diagnostics")
-    arrays = [types.deserialize_cdr(data, msgtype) for _, msgtype, _, data in messages]
+    arrays = [
+        STORE.deserialize_cdr(data, "diagnostic_msgs/msg/DiagnosticArray")
+        for rows in Storage(bag).rows(lambda topic, _: topic == "/diagnostics")
+        for data in rows.batch.messages()
+    ]
     return [status.message for array in arrays for status in array.status if status.name == "panel"]
 
 
