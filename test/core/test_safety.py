@@ -242,6 +242,10 @@ ROWS: dict[str, Sequence[Step]] = {
         carried, let(effort=(3.0, 9.0, 3.0, 3.0)), reads(1, temperature=75), wait(1.0),
         has(lambda arm: arm.drive.effort[1] == pytest.approx(6.75) and "derating (b)" in arm.machine.acted),
     ],
+    "an arm that moves off as if it were empty is let down, and can be carried again": [
+        carried, wait(0.5), has(lambda arm: arm.drive.damping == STILL), move(2, 0.25, 0.9),
+        see(State.LETTING_DOWN, "load_missing"), until(State.FAULT), clear, enable, until(State.ACTIVE), see(fault=""),
+    ],
     "the motors are switched off once nothing holds the arm and it rests": [
         carried, disable, move(2, -0.12, 0.02, is_felt=False),  # for 6 s, slower than the velocity's resolution
         has(lambda arm: arm.drive.powered and arm.drive[:2] == OFF[:2]),

@@ -448,6 +448,7 @@ class SafetyMachine:
         self.pose.withdraw()
         self._since = self._now = max(now, self._now)
         if after is State.PROVING:
+            self.shaper.empty_for = 0.0  # of the arm that was carried before
             self.watch.change_power(PowerChange.SWITCH_ON)
         elif after is State.RAMPING_IN:
             self.watch.change_power(PowerChange.SHOWN_ON)
