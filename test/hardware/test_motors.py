@@ -180,22 +180,31 @@ WORST = [
 ]
 OF_ALL = ("all motors restart in 80 ms", "supply cut for 3 s", "motor 1 loses its power for 1 s",
           "loop stalls for 60 ms", "loop stalls for 300 ms")  # fmt: skip
+# What the motors cause is beyond these bounds: a finding of docs/safety_case.md.
+FINDINGS = [
+    ("v3_2", "loop stalls for 300 ms"),
+    ("open_drive", "loop stalls for 300 ms"),
+    ("seven_joints", "motor 1 loses its power for 1 s"),
+]
 CASES = [*itertools.product((*REPLYING, "damiao"), EVENTS), *itertools.product(("elbow", "seven_joints"), OF_ALL)]
 
 
 @pytest.mark.parametrize(("kind", "event"), quick([*WORST, *itertools.product(["elbow"], OF_ALL[1::3])], CASES))
-def test_whatever_the_firmware_drops_the_motors_drive_no_joint(kind: str, event: str) -> None:
+def test_whatever_the_firmware_drops_the_motors_drive_no_joint(
+    kind: str, event: str, request: pytest.FixtureRequest
+) -> None:
     """A motor that has lost its torque lets its joint fall; what counts is what motors drive, then and afterwards."""
+    if (kind, event) in FINDINGS:
+        request.applymarker(pytest.mark.xfail(strict=True, reason="docs/safety_case.md"))
     arm = raised_arm(kind)
     EVENTS[event](arm)
     arm.run(3.0 if "cut" not in event else 4.0)
     if arm.state is not State.ACTIVE:
         assert arm.safety.fault
         arm.run_until(lambda: arm.loop.is_off, 11.0)
-    # V3 boards after 300 ms are beyond the bound: docs/safety_case.md says so.
-    stalled = 0.5 if (kind, event) == ("v3_2", "loop stalls for 300 ms") else ENERGY
-    speed, energy = (DRIVEN, stalled) if "stalls" in event else UNKNOWN_LOSS
-    arm.assert_not_thrown(speed, ENERGY if "loses its power" in event and kind in ("ak", "open_drive") else energy)
+    is_stall, is_one = "stalls" in event, "loses its power" in event
+    speed, energy = (DRIVEN, ENERGY) if is_stall else UNKNOWN_LOSS
+    arm.assert_not_thrown(speed, ENERGY if is_one and kind in ("ak", "open_drive") else energy)
     assert not any(motor.dips for motor in arm.motors) or arm.safety.fault, "torque was lost without a word"
 
 
