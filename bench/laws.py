@@ -3,7 +3,7 @@
 
 from collections.abc import Iterator
 from functools import partial
-from typing import cast
+from typing import Any, cast
 
 import numpy as np
 
@@ -80,14 +80,15 @@ def _measure_urdf(file: str, blocks: int) -> Iterator[Row]:
     import pinocchio as pin
 
     arm = cast(UrdfArm, read_arm(load(packaged_config(file)), "/right").settings.robot)
-    text = read_urdf(load(packaged_config(file))["/right/compensator"]["urdf.file"])
-    model = pin.buildModelFromXML(text)
+    model = pin.buildModelFromXML(read_urdf(load(packaged_config(file))["/right/compensator"]["urdf.file"]))
     model.gravity.linear = np.array((0.0, 0.0, -arm.gravity))
     data, count = model.createData(), len(arm.length)
     poses = np.random.default_rng(1).uniform(-1.5, 1.5, (POSES, count))
     upright = np.tile(Tilt.of("left").direction, (POSES, 1))
 
-    loop = lambda: [pin.computeGeneralizedGravity(model, data, pose) for pose in poses[:LOOP]]  # noqa: E731
+    def loop() -> list[Any]:
+        return [pin.computeGeneralizedGravity(model, data, pose) for pose in poses[:LOOP]]
+
     np.testing.assert_allclose(arm.gain * loop(), arm.torques(poses[:LOOP], upright[:LOOP]), atol=1e-12)
     ours, peer = race(((lambda: arm.torques(poses, upright), 1), (loop, 1)), blocks)
     name = f"law of a URDF with {count} joints"
