@@ -150,18 +150,19 @@ def _run_cohort(options: argparse.Namespace, criteria: HoldCriteria, on_paper: h
         task = progress.add_task("", total=len(recordings))
         rows = cohort.summaries(recordings, work, run, lambda: progress.advance(task))
     trials = study.trials_of(rows)
-    of_study = {"statistics": study.statistics(trials, keys), "differences": study.differences(trials, keys)}
-    for table, content in {"cohort": rows, **of_study}.items():
-        write_rows(output / f"{table}.csv", [*content])
+    conditions, compared = [*study.statistics(trials, keys)], [*study.differences(trials, keys)]
+    for table, content in (("cohort", rows), ("statistics", conditions), ("differences", compared)):
+        write_rows(output / f"{table}.csv", content)
+    tables = study.tables_of(trials, conditions, compared)
     readable = [*{row["recording"]: None for row in rows if row["verdict"]}]
     _export(options, output, lambda: (read_bag(recording, options.decimate) for recording in readable))
     stamp = STAMPS[of_all(Source(row["source"]) for row in trials if row["verdict"])]
     drawn = study.figure(trials, keys)
     png = html.saved(drawn, output / "cohort.png", stamp, on_paper) if drawn else b""
     name = options.bag[0].resolve().stem if len(options.bag) == 1 else f"{len(recordings)} recordings"
-    (output / "cohort.html").write_text(study.page(trials, name, keys, png), encoding="utf-8")
+    (output / "cohort.html").write_text(study.page(trials, name, tables, png), encoding="utf-8")
     console = Console(highlight=False, width=None if Console().is_terminal else 200)
-    study.print_trials(trials, keys, console)
+    study.print_trials(trials, tables, console)
     console.print(study.summary_of(trials), soft_wrap=True)
     console.print(f"Written: cohort.html, its figure and tables in {output}", markup=False, soft_wrap=True)
     if study.problems_of(trials):

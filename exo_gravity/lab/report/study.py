@@ -92,6 +92,7 @@ class Condition(NamedTuple):
 
 
 Values = Mapping[Condition, Mapping[str, float]]
+Cells = tuple[str, Sequence[str], Sequence[Sequence[str]]]  # title, headings and cells of a table
 
 
 def values_of(trials: Iterable[Row], measure: Measure, keys: Sequence[str] = KEYS) -> Values:
@@ -182,13 +183,14 @@ def _cells(row: Row) -> list[str]:
     return [*(text or "" for text in texts), *numbers, row["verdict"] or row["problem"]]
 
 
-def _tables_of(trials: Sequence[Row], keys: Sequence[str]) -> Iterator[tuple[str, Sequence[str], list[list[str]]]]:
-    """Yield title, headings and cells of each table: the statistics, and all trials."""
-    for title, rows in (("Conditions", statistics(trials, keys)), ("Paired differences", differences(trials, keys))):
-        if found := [*rows]:
-            cells = [[f"{x:#.4g}" if isinstance(x, float) else str(x) for x in row.values()] for row in found]
-            yield title, [*found[0]], cells
-    yield "Trials", HEADINGS, [*map(_cells, trials)]
+def tables_of(trials: Sequence[Row], conditions: Sequence[Row], compared: Sequence[Row]) -> list[Cells]:
+    """Return the tables of a study: its statistics, as `statistics` and `differences` give them, and all trials."""
+    tables: list[Cells] = []
+    for title, rows in (("Conditions", conditions), ("Paired differences", compared)):
+        if rows:
+            cells = [[f"{x:#.4g}" if isinstance(x, float) else str(x) for x in row.values()] for row in rows]
+            tables.append((title, [*rows[0]], cells))
+    return [*tables, ("Trials", HEADINGS, [*map(_cells, trials)])]
 
 
 def problems_of(trials: Iterable[Row]) -> list[str]:
@@ -204,9 +206,9 @@ def summary_of(trials: Sequence[Row]) -> str:
     return f"{sum(row['held'] for row in read)} of {len(read)} trials held{rest}"
 
 
-def print_trials(trials: Sequence[Row], keys: Sequence[str], console: Console) -> None:
-    """Print a table with a row for each trial, the statistics, and what failed."""
-    for title, heads, cells in _tables_of(trials, keys):
+def print_trials(trials: Sequence[Row], tables: Iterable[Cells], console: Console) -> None:
+    """Print the tables of `tables_of`, and what failed."""
+    for title, heads, cells in tables:
         table = Table(box=box.SIMPLE_HEAD, padding=(0, 1, 0, 0), pad_edge=False, title=title, title_justify="left")
         for heading in heads:
             table.add_column(heading)
@@ -217,42 +219,44 @@ def print_trials(trials: Sequence[Row], keys: Sequence[str], console: Console) -
         console.print(f"Not reported: {problem}", markup=False)
 
 
-def page(trials: Sequence[Row], name: str, keys: Sequence[str], png: bytes) -> str:
-    """Return the trials as an HTML page. name: of the cohort. png: the picture of `figure`."""
+def page(trials: Sequence[Row], name: str, tables: Iterable[Cells], png: bytes) -> str:
+    """Return the trials as an HTML page. name: of the cohort. tables: by `tables_of`. png: the picture of `figure`."""
     read = [row for row in trials if row["verdict"]]
     problems = problems_of(trials)
-    subjects = len({row["subject"] for row in read})
     dates = sorted(row["date"][:10] for row in read)
-    when = f"{len(read)} trials, {subjects} subjects, {' to '.join(sorted({*dates[:1], *dates[-1:]}))}"
-    held = all(row["held"] for row in read)
-    caption = "Left, each condition: mean and 95 % interval, and a line for each wearer. Right, if there are several "
-    tables = [
-        (html.heading(title, 2), html.table(heads, [((), cells)])) for title, heads, cells in _tables_of(trials, keys)
-    ]
+    subjects = {row["subject"] for row in read}
+    when = f"{len(read)} trials, {len(subjects)} subjects, {' to '.join(sorted({*dates[:1], *dates[-1:]}))}"
+    caption = (
+        "Left, each condition: mean and 95 % interval, and a line for each wearer. Right, if there are several days, "
+        "each wearer and condition over them."
+    )
     return html.document(
         name,
         when,
         [
-            html.verdict(f"{summary_of(trials)}.", good=bool(read) and held and not problems),
+            html.verdict(
+                f"{summary_of(trials)}.", good=bool(read) and all(row["held"] for row in read) and not problems
+            ),
             html.bullets("Not reported", problems),
-            html.picture(png, f"{caption}days, each wearer and condition over them.") if png else "",
-            *chain(*tables),
+            html.picture(png, caption) if png else "",
+            *chain.from_iterable(
+                (html.heading(title, 2), html.table(heads, [((), cells)])) for title, heads, cells in tables
+            ),
             f"<footer><p>{TERMS}</p><p>{METHOD}</p></footer>",
         ],
     )
 
 
 def figure(trials: Sequence[Row], keys: Sequence[str]) -> Figure | None:
-    """Return the measures by condition and, where somebody has several, over the sessions; None without any."""
+    """Return the measures by condition, and over sessions where a wearer has several; None if nothing was measured."""
     series = [one for one in _series_of(trials, keys) if one[2][-1] > 1]
-    measures = [measure for measure in MEASURES if values_of(trials, measure, keys)]
-    if not measures:
+    measured = {measure: found for measure in MEASURES if (found := values_of(trials, measure, keys))}
+    if not measured:
         return None
-    drawn = Figure(figsize=(12.0, 2.6 * len(measures)), layout="constrained")
-    axes: Any = drawn.subplots(len(measures), 1 + bool(series), sharex="col", squeeze=False)
+    drawn = Figure(figsize=(12.0, 2.6 * len(measured)), layout="constrained")
+    axes: Any = drawn.subplots(len(measured), 1 + bool(series), sharex="col", squeeze=False)
     colours = html.joint_colours(len(series))
-    for row, measure in zip(axes, measures, strict=True):
-        groups = values_of(trials, measure, keys)
+    for row, (measure, groups) in zip(axes, measured.items(), strict=True):
         for who in {who: None for group in groups.values() for who in group}:
             line = [group.get(who, np.nan) for group in groups.values()]
             row[0].plot(line, "o-", ms=3, lw=0.8, color=html.FAINT, zorder=1)
