@@ -146,8 +146,7 @@ def test_along_a_path_across_the_edge_of_the_box_the_torque_neither_steps_nor_ch
     replaced = [bool(run.cycle(theta=(0.2, angle, 0.6, 0.5)).fallback) for angle in theta_2.tolist()]
     # The exact law changes by up to 3 Nm/rad along the path.
     remainders = GUIDANCE.rate * PERIOD
-    path = 3.0 * width * 2 * math.pi * hertz * PERIOD
-    assert run.largest_step <= 2 * remainders + path
+    assert run.largest_step <= 2 * remainders + 3.0 * width * 2 * math.pi * hertz * PERIOD
     switches = np.flatnonzero(np.diff(replaced))
     assert all(b - a >= FALLBACK_TIME / PERIOD - 1 for a, b in zip(switches[::2], switches[1::2], strict=False))
 

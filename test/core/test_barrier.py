@@ -78,8 +78,8 @@ def test_only_what_turns_faster_than_people_shake_gets_less_damping(frequency, l
         speed = 0.5 * math.sin(2.0 * math.pi * frequency * 0.01 * cycle)
         damping = arm.damping(0.01, joints(velocity=speed), HEARD, NOTHING, (DAMPING,) * 4, is_late=False)
     assert min(damping) == pytest.approx(least, abs=0.05)
-    later = arm.damping(10.0, joints(velocity=0.0), HEARD, NOTHING, (DAMPING,) * 4, is_late=False)
-    assert later == (DAMPING,) * 4
+    full = (DAMPING,) * 4
+    assert arm.damping(10.0, joints(velocity=0.0), HEARD, NOTHING, full, is_late=False) == full
 
 
 def test_what_vibrates_without_damping_keeps_its_own_and_the_brake_of_a_driven_joint_stays():

@@ -112,8 +112,7 @@ def test_a_joint_that_the_change_drives_gets_its_old_torque_back_until_it_is_cal
     before = run.efforts[-1]
     run.compensator.apply(settings_with())
     run.cycle(GUIDANCE.time / 2)
-    falling = (0.0, -1.0, 0.0, 0.0)
-    answer = run.cycle(1.0, velocity=falling)
+    answer = run.cycle(1.0, velocity=(0.0, -1.0, 0.0, 0.0))
     assert answer.effort[1] == pytest.approx(before[1])  # and no more, however long it falls
     assert answer.remainder[1] == pytest.approx(before[1] - gravity_torque(ROBOT, THETA)[1])
     assert abs(answer.effort[3]) < abs(before[3])

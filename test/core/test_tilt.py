@@ -70,8 +70,7 @@ def test_lying_and_bowed_beyond_90_degrees_gravity_is_that_of_the_arms_base(side
             tilt.set_tilt(10.0 + 0.01 * n, *pitch_roll(gravity))
         else:
             tilt.set_gravity(10.0 + 0.01 * n, gravity)
-        expected = BASE_FROM_TRUNK[side] @ gravity
-        assert tilt.at(10.0 + 0.01 * n).direction == pytest.approx(expected, abs=1e-9)
+        assert tilt.at(10.0 + 0.01 * n).direction == pytest.approx(BASE_FROM_TRUNK[side] @ gravity, abs=1e-9)
 
 
 UPSIDE_DOWN = {  # what an IMU shows of a person who stands

@@ -188,8 +188,7 @@ def struck(rig: StruckArm) -> int:
 
 def error_code(rig: StruckArm) -> int:
     """Return the code of an error of the struck motor."""
-    family = rig.motors[rig.struck].joint.spec.family
-    return DAMIAO_ERROR if family == DAMIAO_MIT.family else AK_ERROR
+    return DAMIAO_ERROR if rig.motors[rig.struck].joint.spec.family == DAMIAO_MIT.family else AK_ERROR
 
 
 def power(on: bool, *joints: int) -> Action:

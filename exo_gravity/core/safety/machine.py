@@ -361,9 +361,8 @@ class SafetyMachine:
         is_guided = damped or self.state is State.RAMPING_IN
         share = [1.0 - left for left in self._rise.shares]
         late = DAMPING if self.ride.is_riding else 0.0
-        sent = self._sent.effort
         torque, damping = self.shaper.shape(
-            self._dt, joints, effort, share, sent, is_guided, late, self.watch.pause_damping
+            self._dt, joints, effort, share, self._sent.effort, is_guided, late, self.watch.pause_damping
         )
         self.acted.update(dict.fromkeys(self.shaper.acted, self._now))
         return self._powered(torque, damping, self._commands)

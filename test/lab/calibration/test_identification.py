@@ -388,8 +388,7 @@ def test_the_heading_is_corrected_only_if_it_shows(tmp_path):
         for observation in observations[0], observations[-1]:
             pitch = pitches[bool(observation.load_mass)]
             moved = rotation_matrix(mounting) @ in_trunk("right", observation.direction)
-            wrong = np.linalg.norm(moved - gravity_in_trunk(pitch, 0.2))
-            assert wrong < np.radians(0.3)
+            assert np.linalg.norm(moved - gravity_in_trunk(pitch, 0.2)) < np.radians(0.3)
         heading = np.arctan2(rotation_matrix(mounting)[1, 0], rotation_matrix(mounting)[0, 0])
         assert (abs(heading) > HEADING / 2.0) == is_shown
         assert (NO_HEADING in outcome.lines) != is_shown
