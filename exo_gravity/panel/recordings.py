@@ -174,7 +174,7 @@ class Recordings:
         failed = await trial.wait() not in (0, 1)
         name, problem = self._progress["name"], refused or self._progress.get("problem", "")
         problem = problem or (lines[-1] if failed and lines else "")
-        key = self._key(self._folder) if self._folder else ""
+        key = self._key(self._folder, REPORT) if self._folder else ""
         self._progress = {"phase": "done", "name": name, "problem": problem, "report": key}
         self._note(f"trial {name} has ended: {problem or 'done'}")
 
@@ -208,22 +208,26 @@ class Recordings:
 
     def past(self) -> dict[str, list[Any]]:
         """Return the codes of all subjects, and the recordings and trials, the newest first."""
-        found = []
+        found: list[tuple[dict[str, Any], Path]] = []
         for path in (*self._output.glob("*_*/"), *self._output.glob("*/*-*-*/*_*/")):
-            key = self._key(path)
-            if (match := FOLDER_NAME.fullmatch(path.name)) and (key or (path / "bag").is_dir()):
+            if (match := FOLDER_NAME.fullmatch(path.name)) and (self._key(path, REPORT) or self._key(path, "bag")):
                 name, year, month, day, hour, minute, second, _ = match.groups()
                 *subject, _ = path.relative_to(self._output).parts
                 when = f"{year}-{month}-{day} {hour}:{minute}:{second}"
-                told: dict[str, Any] = {"verdict": "", "protocol": "", "seconds": None}
-                with contextlib.suppress(OSError, ValueError):  # none was written, or in part
-                    told |= json.loads((path / "report.json").read_text(encoding="utf-8"))
-                entry = {"subject": "".join(subject[:1]), "trial": name, "when": when, "report": key, **told}
-                folder = path.relative_to(self._output).as_posix() if (path / "bag").is_dir() else ""
-                found.append({**entry, "folder": folder})
-        found.sort(key=lambda entry: entry["when"], reverse=True)
+                found.append(({"subject": "".join(subject[:1]), "trial": name, "when": when}, path))
+        found.sort(key=lambda each: each[0]["when"], reverse=True)
         kept = {path.parent.name for path in self._output.glob(f"*/{WEARER}")}
-        return {"subjects": sorted(kept | {entry["subject"] for entry in found} - {""}), "past": found[:MOST_LISTED]}
+        return {
+            "subjects": sorted(kept | {entry["subject"] for entry, _ in found} - {""}),
+            "past": [{**entry, **self._content(path)} for entry, path in found[:MOST_LISTED]],
+        }
+
+    def _content(self, path: Path) -> dict[str, Any]:
+        """Return what the folder `path` of a trial has: what its report says, and the names of report and recording."""
+        said: dict[str, Any] = {"verdict": "", "protocol": "", "seconds": None}
+        with contextlib.suppress(OSError, ValueError):  # none was written, or only a part
+            said |= json.loads((path / "report.json").read_text(encoding="utf-8"))
+        return {**said, "report": self._key(path, REPORT), "folder": self._key(path, "bag")}
 
     def file(self, name: str, pattern: str) -> Path | None:
         """Return the first file of that pattern in the folder `name` below `output`; None without one."""
@@ -232,9 +236,9 @@ class Recordings:
             return path if path.is_relative_to(self._output) and path.is_file() else None
         return None
 
-    def _key(self, folder: Path) -> str:
-        """Return the `name` of the report in this folder, '' without one."""
-        return folder.relative_to(self._output).as_posix() if (folder / REPORT).is_file() else ""
+    def _key(self, folder: Path, part: str) -> str:
+        """Return the name of this folder for `file`, '' if it has no such part."""
+        return folder.relative_to(self._output).as_posix() if (folder / part).exists() else ""
 
     def _is_recording(self) -> bool:
         return self._recorder is not None and self._recorder.exit_code(RECORDER) is None
