@@ -81,16 +81,7 @@ class Storage:
         check_name(path)
         if not self.path.exists():
             raise DataError(f"{path}: no such file or folder")
-        here = (
-            sorted(
-                self.path.iterdir(),
-                key=lambda file: [  # bag_2 before bag_10
-                    int(part) if part.isdigit() else part for part in re.split(r"(\d+)", file.name)
-                ],
-            )
-            if self.path.is_dir()
-            else [self.path]
-        )
+        here = sorted(self.path.iterdir(), key=_natural) if self.path.is_dir() else [self.path]
         files = [f for f in here if f.is_file() and (f == self.path or not f.name.startswith("."))]
         self.files = [file for file in files if kind_of(file)]
         if not self.files:
@@ -284,3 +275,8 @@ def _named_files(metadata: Path) -> list[str]:
         return [Path(path).name for path in content["rosbag2_bagfile_information"]["relative_file_paths"]]
     except (OSError, ValueError, yaml.YAMLError, LookupError, TypeError, RecursionError):
         return []
+
+
+def _natural(path: Path) -> list[int | str]:
+    """Return a sort key that puts bag_2 before bag_10."""
+    return [int(part) if part.isdigit() else part for part in re.split(r"(\d+)", path.name)]

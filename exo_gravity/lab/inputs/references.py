@@ -35,8 +35,7 @@ def gravload(arm: ArmModel) -> Reference:
     g = arm.gravity * -math.copysign(1.0, robot.gravity[2])
 
     def torque(theta: np.ndarray, direction: np.ndarray) -> np.ndarray:
-        poses = zip(theta, g * direction, strict=True)
-        unscaled = np.array([robot.gravload(q, gravity) for q, gravity in poses])
+        unscaled = np.array([robot.gravload(q, gravity) for q, gravity in zip(theta, g * direction, strict=True)])
         return np.asarray(arm.gain * unscaled)
 
     return torque

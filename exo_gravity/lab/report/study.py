@@ -201,8 +201,7 @@ def problems_of(trials: Iterable[Row]) -> list[str]:
 def summary_of(trials: Sequence[Row]) -> str:
     """Return how many trials held."""
     read = [row for row in trials if row["verdict"]]
-    unread = len(problems_of(trials))
-    rest = f"; recordings not read, or not completely: {unread}" if unread else ""
+    rest = f"; recordings not read, or not completely: {len(found)}" if (found := problems_of(trials)) else ""
     return f"{sum(row['held'] for row in read)} of {len(read)} trials held{rest}"
 
 
@@ -270,9 +269,8 @@ def figure(trials: Sequence[Row], keys: Sequence[str]) -> Figure | None:
             values = np.array([measure.of(one) for one in rows])
             known = np.isfinite(values)
             days = np.unique(session[known])
-            means = [values[known & (session == day)].mean() for day in days]
             row[1].plot(session, values, "o", ms=4, color=colour, alpha=0.6)
-            row[1].plot(days, means, color=colour, lw=1.2, label=name)
+            row[1].plot(days, [values[known & (session == d)].mean() for d in days], color=colour, lw=1.2, label=name)
         for axis in row:
             axis.ticklabel_format(axis="y", useOffset=False)
             html.make_plain(axis)
