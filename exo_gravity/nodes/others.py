@@ -1,5 +1,5 @@
 # Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
-"""What a node beside the path knows of others: their parameters, and the newest messages of a status or topic."""
+"""Parameters, status and newest messages of other nodes, for nodes that are not on the path of a torque."""
 
 import math
 import time

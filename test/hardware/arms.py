@@ -235,7 +235,7 @@ def cut(duration: float, *joints: int) -> Callable[[Rig], None]:
 
 
 def lose_bus(arm: CarriedArm, name: str = FIRST) -> None:
-    """Let a bus fail, and let nobody open it again."""
+    """Make a bus fail so that it cannot be reopened."""
     arm.wires[name].refusal = BusError("no such device")
     arm.wires[name].break_down(can.CanOperationError("No buffer space available"))
 

@@ -539,7 +539,7 @@ def test_efforts_for_an_effort_controller_are_refused_in_one_process(called):
         called("command_interface:=multi_array")
 
 
-# The wearer beside it
+# The node `wearer`
 
 LOAD = Wearer(75.0).on_links(ROBOT.length)
 NEEDED = gravity_torque(ROBOT.with_wearer(LOAD.mass, LOAD.cog), POSE)

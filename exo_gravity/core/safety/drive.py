@@ -173,7 +173,7 @@ class FaultCode(str, Enum):
         "unexplained_torque",
         "the efforts exceed what gravity needs of any load up to `largest_moment`, plus `largest_addition`",
     )
-    LOAD_MISSING = "load_missing", "joints that were still are driven as if what they carry had left them"
+    LOAD_MISSING = "load_missing", "joints at rest moved off as if the arm had lost its load"
     SECOND_COMMANDER = "second_commander", "two publishers send effort commands"
     # The operator
     CONTROL_LOST = "control_lost", "who held control of the arm has not renewed it for 1 s", RESUME

@@ -237,7 +237,7 @@ class SafetyMachine:
         if self.state in CARRIED and (found_off := self._found_off()):
             return found_off
         if self.shaper.empty_for >= STILLNESS.empty:
-            why = "motors drive the arm as if it were empty: is an arm in the cuff, the load in the hand, the IMU firm?"
+            why = "the arm moved off as if it were empty: is an arm in the cuff, the load in the hand, the IMU fixed?"
             return Fault(FaultCode.LOAD_MISSING, why)
         if efforts.effort is None:
             return Fault(FaultCode.COMMAND_WITHDRAWN, "the compensator withdrew its efforts; see its diagnostics")

@@ -17,13 +17,11 @@ true speed: one wrong speed in a reply moves nothing. A light arm passes F withi
 by its change over BARRIER.lead, at any rate of the loop. An empty forearm under 3 Nm still reaches 2.7 rad/s at 250 Hz,
 and 6.4 at 100 Hz. A wearer who lifts their arm feels nothing up to V; at F they lift it without support.
 
-What a joint carries may leave it at once: a strap opens, a tool falls. Within a cycle of 4 ms the loop knows nothing of
-it, and a light forearm gains 2 rad/s. So a joint that is still is damped, by |tau| / `STILLNESS.speed`: what its torque
-then drives alone gets no faster. It is not while its torque is guided: too much of it would not show. One that moves
-off as people do is let go within a few cycles: reaches of 0.4 to 12 s cost a wearer of 75 kg at most 0.1 Nm RMS. If one
-moves off faster, the whole arm stays damped, until nothing drives it or someone moves it faster. After
-`STILLNESS.empty` the arm is let down. An empty arm in Zero-G reaches 1.4 rad/s with 1 J, at 100 to 500 Hz; without this
-5.0 rad/s at 100 Hz, 2.6 at 250, and 6.8 J.
+An arm can lose its load at once: a strap opens, a tool falls. In the 4 ms until the loop sees it a light forearm gains
+2 rad/s. So joints at rest are damped by |tau| / `STILLNESS.speed`, and an unloaded joint gets no faster than that. The
+damping is off while the torque is guided: it would hide a torque that is too large. A wearer who moves off frees the
+joint within a few cycles. If a joint moves off faster than a wearer can, the whole arm stays damped until nothing
+drives it, or someone moves it faster; after `STILLNESS.empty` the arm is let down.
 
 A motor that is late with its replies may have lost its power. Its joint falls, and the torque of the others, which
 answers the pose before, drives them. Meanwhile V is BARRIER.calm and F is BARRIER.still for all joints. This brake ends
@@ -69,7 +67,7 @@ class BarrierTuning:
 
 @dataclass(frozen=True)
 class StillnessTuning:
-    """How a motor damps a joint that is still: what it carries may leave it within a cycle."""
+    """How joints at rest are damped, and how an arm that has lost its load shows."""
 
     speed: float = 1.0  #: rad/s, at which the damping then balances the torque
     still: float = 0.1  #: rad/s; four codes of the velocity
