@@ -12,7 +12,7 @@ from __future__ import annotations
 import copy
 import math
 import os
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
@@ -43,10 +43,6 @@ PACKAGE = "package://"
 # The compensator's parameters.
 MOMENT_NAMES, TURN_NAMES = (tuple(f"urdf.{what}_{axis}" for axis in "xyz") for what in ("moment", "turn"))
 LEAST_POSES = 500  # at random, for the least inertia
-BASE_POSES = 60  # at random, from which the moments are found that torque can show
-DEPENDENT = 1e-6  # of the largest column: what is left of one that depends on others
-INERTIAL, MOMENT = 10, slice(1, 4)  # parameters of a link in Pinocchio's regressor, and those of its first moment
-Base = Sequence[tuple[int, np.ndarray]]
 
 
 def read_urdf(path: str) -> str:
@@ -266,7 +262,15 @@ class UrdfArm(UrdfShape):
         direction: (m, 3), gravity's unit vectors in the left arm's base frame, as `Tilt.direction`.
         """
         x, y, z = np.transpose(direction)
-        return self.gain * self._torques(np.asarray(theta), self.gravity * np.transpose((y, x, -z)))
+        model, data = self._model.copy(), self._model.createData()  # its own gravity: another thread may use the arm
+        model.gravity.angular = np.zeros(3)
+        poses = np.asarray(theta)
+        torques = np.empty((len(poses), model.nv))
+        downs = self.gravity * np.transpose((y, x, -z))
+        for row, down, at in zip(torques, downs, self.moves.configurations(poses), strict=True):
+            model.gravity.linear = down
+            row[:] = self._pin.computeGeneralizedGravity(model, data, at)
+        return np.asarray(self.gain * (torques @ self.moves.own))
 
     def turning_torque(self, side: str, theta: Sequence[float], angular_acceleration: Sequence[float]) -> Torque:
         """Return the torque (n,) in Nm that turns the arm at `theta` (n,) rad along with its base.
@@ -298,11 +302,11 @@ class UrdfArm(UrdfShape):
         """Return this arm with joints whose axes lie otherwise, in place of any other turn.
 
         turn: (n, 3) rad, rotation vector by which the place of each joint differs from the URDF's, in the joint's
-        frame. `base` remains that of the URDF: axes that are nearly parallel show next to nothing more.
+        frame.
         """
         if np.array_equal(turn, self.turn):
             return self
-        _, bare = self.base, self._bare.copy()  # the arm that is returned keeps the base
+        bare = self._bare.copy()
         for joint, old, new in zip(self._joints, self.turn, turn, strict=True):
             place = bare.jointPlacements[joint]
             place.rotation = place.rotation @ self._pin.exp3(old).T @ self._pin.exp3(new)
@@ -316,100 +320,6 @@ class UrdfArm(UrdfShape):
         """
         carried = one_float("support", support, 0.0, 1.0) * np.asarray(moments, dtype=float)
         return self._with(_held=replace(self._held, worn=(), moments=tuple(map(tuple, carried.tolist()))))
-
-    @cached_property
-    def base(self) -> tuple[tuple[int, np.ndarray], ...]:
-        """The k moments that gravity's torque can show: each a joint's number, and a unit vector (3,) in its frame.
-
-        Of a link's first moment the part along its joint's axis turns with the link before, as masses do: both count as
-        the first moments of that link. The rest are columns of the regressor, from which a QR decomposition in random
-        poses leaves out those that depend on others (M. Gautier, ICRA 1990).
-        """
-        across = []
-        for n, joint in enumerate(self._joints):
-            if self._bare.inertias[joint].mass:
-                across += [(n, way) for way in self._across(n)]
-        rows = self._rows(*self._sampled(0), across).reshape(-1, len(across))
-        size = np.abs(np.diag(np.linalg.qr(rows, mode="r")))
-        return tuple(one for one, own in zip(across, size, strict=True) if own > DEPENDENT * size.max())
-
-    def regressor(self, theta: np.ndarray, direction: np.ndarray) -> np.ndarray:
-        """Return the torque of each joint per unit of each moment of `base`: (m, n, k) in Nm per kg m.
-
-        theta: (m, n) rad. direction: (3,) or (m, 3), gravity's unit vector in the root link's axes. Gains do not count.
-        """
-        return self._rows(theta, self.gravity * np.reshape(direction, (-1, 3)), self.base)
-
-    def holding(self, moments: np.ndarray) -> Callable[[Sequence[float], Tilt], Torque]:
-        """Return a function that computes the torque (n,) in Nm from theta (n,) rad and tilt, with moments per joint.
-
-        moments: (n, k) kg m of `base`, a row for each joint. Gains do not count. The function has
-        data of its own; use it on one thread at a time.
-        """
-        rows_at = self._rows_at(self.base)
-
-        def torque(theta: Sequence[float], tilt: Tilt) -> Torque:
-            gravity = self.gravity * tilt.magnitude * np.array(tilt.gravity_in_trunk)
-            rows = rows_at(self.moves.configuration(theta), gravity)
-            return tuple(np.einsum("jk,jk->j", rows, moments).tolist())
-
-        return torque
-
-    @property
-    def moments(self) -> np.ndarray:
-        """The moments (k,) in kg m of `base`, of all that the arm holds."""
-        sampled = self._sampled(1)
-        rows, torque = self._rows(*sampled, self.base), self._torques(*sampled)
-        return np.asarray(np.linalg.lstsq(rows.reshape(-1, rows.shape[-1]), torque.ravel(), rcond=None)[0])
-
-    def with_more_moments(self, moments: np.ndarray) -> UrdfArm:
-        """Return this arm with `moments` (k,) kg m of `base` added to those of the robot. Raises ParameterError."""
-        change = self.change.copy()
-        for (n, way), more in zip(self.base, moments, strict=True):
-            change[n] += more * way
-        return self.corrected(change)
-
-    def _torques(self, theta: np.ndarray, gravity: np.ndarray) -> np.ndarray:
-        """Return the torque (m, n) in Nm, gains of 1, at `theta` (m, n) rad. gravity: (m, 3) m/s^2 in root axes."""
-        model, data = self._model.copy(), self._model.createData()  # its own gravity: another thread may use the arm
-        model.gravity.angular = np.zeros(3)
-        torques = np.empty((len(theta), model.nv))
-        for row, down, at in zip(torques, gravity, self.moves.configurations(theta), strict=True):
-            model.gravity.linear = down
-            row[:] = self._pin.computeGeneralizedGravity(model, data, at)
-        return torques @ self.moves.own
-
-    def _rows(self, theta: np.ndarray, gravity: np.ndarray, base: Base) -> np.ndarray:
-        """Return the torque (m, n, k) in Nm of moments of 1 kg m at `theta` (m, n) rad. gravity: (m, 3) m/s^2."""
-        rows_at, rows = self._rows_at(base), np.empty((len(theta), len(self.names), len(base)))
-        downs = np.broadcast_to(gravity, (len(theta), 3))
-        for row, down, at in zip(rows, downs, self.moves.configurations(theta), strict=True):
-            row[:] = rows_at(at, down)
-        return rows
-
-    def _rows_at(self, base: Base) -> Callable[[np.ndarray, np.ndarray], np.ndarray]:
-        """Return a function that returns the same (n, k) for one configuration and gravity (3,) in m/s^2.
-
-        Its model is its own: another thread may use the arm.
-        """
-        model, data = self._model.copy(), self._model.createData()
-        model.gravity.angular, still, shape = np.zeros(3), np.zeros(model.nv), (len(self.names), -1, INERTIAL)
-        links, ways = zip(*base, strict=True)
-        columns, along = np.take(self._joints, links) - 1, np.array(ways)
-
-        def rows_at(at: np.ndarray, gravity: np.ndarray) -> np.ndarray:
-            model.gravity.linear = gravity
-            rows = self._pin.computeJointTorqueRegressor(model, data, at, still, still).reshape(model.nv, -1)
-            parts = (self.moves.own.T @ rows).reshape(shape)[..., MOMENT]
-            return np.einsum("nka,ka->nk", parts[:, columns], along)
-
-        return rows_at
-
-    def _sampled(self, seed: int) -> tuple[np.ndarray, np.ndarray]:
-        """Return poses (m, n) in rad at random, each with a vector of gravity (m, 3) in m/s^2."""
-        random = np.random.default_rng(seed)
-        poses = random.uniform(-math.pi, math.pi, (BASE_POSES, len(self.names)))
-        return poses, random.normal(size=(BASE_POSES, 3))
 
     def massless(self, gravity: float) -> UrdfArm:
         """Return an arm with these joints, without any mass, with gains of 1, where gravity is `gravity` m/s^2."""

@@ -6,13 +6,13 @@ from __future__ import annotations
 import math
 from collections.abc import Collection, Iterator, Sequence
 from functools import cached_property
-from typing import Any, NamedTuple
+from typing import Any
 from xml.etree import ElementTree
 
 import numpy as np
 
 from exo_gravity import pip_install
-from exo_gravity.core.arm.interface import STANDARD_GRAVITY
+from exo_gravity.core.arm.interface import STANDARD_GRAVITY, Frames, Skeleton
 from exo_gravity.core.errors import ParameterError
 from exo_gravity.core.numbers import MAX_JOINTS
 from exo_gravity.hardware.urdf_checks import LIMITS, carrier_of, checked, links_of, mimics_of, robot_of
@@ -188,23 +188,6 @@ class UrdfJoints:
         return peak, effects / max(float(np.max(peak)), TINY)
 
 
-class Frames(NamedTuple):
-    """The own frames of an arm's joints, and its hand, in m poses, in the root link's axes."""
-
-    before: np.ndarray  #: (m, n, 3, 3) how they would be turned with the joint itself at 0
-    after: np.ndarray  #: (m, n, 3, 3) how they are turned
-    places: np.ndarray  #: (m, n + 1, 3) m, where the joints are, and the hand, or the last joint again
-
-
-class Skeleton(NamedTuple):
-    """What `can_bridge` needs to compute the gravity of an arm of n joints itself, in the root link's axes."""
-
-    axes: np.ndarray  #: (n, 3), unit vectors along the joints' axes while all angles are 0
-    ways: np.ndarray  #: (n, 3), unit vectors along the links, zeros for one without length
-    moments: np.ndarray  #: (n,) kg m, largest first moment along each link, with all mass beyond it
-    beside: np.ndarray  #: (n,) kg m, largest first moment about each joint of masses off the links' axes
-
-
 class UrdfShape:
     """The joints `joint_names` (n,) of the URDF `text`, and their links; `UrdfArm` has what they hold.
 
@@ -267,13 +250,6 @@ class UrdfShape:
         """Of each joint's frame its axis and two unit vectors across it, (n, 3, 3), one a row."""
         return np.array([np.vstack((axis, self._across(n))) for n, axis in enumerate(self._axes)])
 
-    def frames(self, theta: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return how the joints' frames are turned at `theta` (m, n) rad, (m, n, 3, 3) to the root link's axes.
-
-        First as they would be with the joint itself at 0, then as they are.
-        """
-        return self._frames(theta)[:2]
-
     @property
     def moved_by(self) -> np.ndarray:
         """Whether a joint moves the link of another, (n, n): the first index is that joint's."""
@@ -290,7 +266,7 @@ class UrdfShape:
         The origins (n + 1, 3) in m of the joints and the hand, the axes (n, 3) about which the joints turn, and unit
         vectors (n, 3) across them, as far as possible along the links.
         """
-        frames = self._frames(np.array([theta]))
+        frames = self.frames(np.array([theta]))
         turns, along = frames.after[0], self._along_links
         return frames.places[0], *(np.einsum("nab,nb->na", turns, ways) for ways in (self._axes, along))
 
@@ -310,7 +286,7 @@ class UrdfShape:
         While all angles are 0, in the root link's axes.
         """
         links = [self._bare.inertias[joint] for joint in self._joints]
-        turns = self.frames(np.zeros((1, len(links))))[1][0]
+        turns = self.frames(np.zeros((1, len(links)))).after[0]
         centres = [turn @ link.lever for turn, link in zip(turns, links, strict=True)]
         return np.array([link.mass for link in links]), np.array(centres)
 
@@ -319,7 +295,7 @@ class UrdfShape:
         parents = [self._model.parents[joint] for joint in self._joints]
         if not self.moves_alone or parents[1:] != self._joints[:-1]:
             return None
-        turns, ways = self.frames(np.zeros((1, len(parents))))[1][0], self.directions
+        turns, ways = self.frames(np.zeros((1, len(parents)))).after[0], self.directions
         links = [self._model.inertias[joint] for joint in self._joints]
         beyond = np.multiply(self.length, self.masses - [link.mass for link in links])
         own = np.array([link.mass * link.lever for link in links]) + beyond[:, None] * ways
@@ -328,20 +304,14 @@ class UrdfShape:
         axes, along = (np.einsum("nab,nb->na", turns, vectors) for vectors in (self._axes, ways))
         return Skeleton(axes, along, moments, np.cumsum(beside[::-1])[::-1])
 
-    def places(self, theta: np.ndarray) -> np.ndarray:
-        """Return where the joints are at `theta` (m, n) rad, and the hand or the last joint again: (m, n + 1, 3) m.
-
-        In the root link's axes.
-        """
-        return self._frames(theta).places
-
-    def _frames(self, theta: np.ndarray) -> Frames:
-        """Return the frames of the arm's joints, and its hand, at `theta` (m, n) rad."""
+    def frames(self, theta: np.ndarray) -> Frames:
+        """Return where the arm is at `theta` (m, n) rad, in the root link's axes; a link has its joint's frame."""
         model, data, frames = self._model, self._model.createData(), []
         for at in self.moves.configurations(theta):
             self._pin.forwardKinematics(model, data, at)
             frames.append([place.homogeneous for place in data.oMi])
-        places, parents = np.array(frames)[..., :3, :], [model.parents[joint] for joint in self._joints]
+        places = np.reshape(frames, (-1, model.njoints, 4, 4))[..., :3, :]
+        parents = [model.parents[joint] for joint in self._joints]
         turned = places[:, parents, :, :3] @ [model.jointPlacements[joint].rotation for joint in self._joints]
         turns, origins = places[:, self._joints, :, :3], places[..., 3][:, self._joints]
         hand = origins[:, -1:] + turns[:, -1:] @ self._along[-1]

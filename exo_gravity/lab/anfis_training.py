@@ -63,7 +63,7 @@ def axes_of(configured: ConfiguredArm, counts: Sequence[int]) -> list[np.ndarray
 def from_gravload(configured: ConfiguredArm) -> Samples:
     """Return the upright arm's torques by the Robotics Toolbox at the paper's positions, and half-way between them."""
     axes = axes_of(configured, GRID)
-    reference = gravload(replace(configured.papers, gain=np.ones(4)))
+    reference = gravload(replace(configured.paper_arm, gain=np.ones(4)))
     middles = [(axis[1:] + axis[:-1]) / 2 for axis in axes]
     theta, between = (np.array(list(product((0.0,), *angles))) for angles in (axes, middles))
     torque, torque_between = (reference(at, np.tile((0.0, 0.0, 1.0), (len(at), 1)))[:, 1:] for at in (theta, between))

@@ -32,7 +32,6 @@ from exo_gravity.core.numbers import Vector, floats
 from exo_gravity.core.safety.explain import GRAVITY
 from exo_gravity.core.safety.limits import HEAT
 from exo_gravity.lab.inputs.arms import ConfiguredArm
-from exo_gravity.lab.moments import chain_of
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -289,7 +288,7 @@ def verdict(arm: ArmBudget, names: str, what: str) -> Iterator[str]:
         yield "The robot alone needs more than rated torque somewhere: no support stays within it."
     elif arm.support:
         yield f"The largest support within rated torque everywhere is {fits:g}."
-    skeleton = chain_of(arm.carrying).skeleton()
+    skeleton = arm.carrying.skeleton()
     if skeleton is None:  # not a single chain: can_bridge cannot judge its efforts
         return
     yield f"For the can_bridge of {names}, if it never carries more; add what assistance and terms may add:"

@@ -85,13 +85,13 @@ def cases(cog: str, configured: ConfiguredArm, count: int) -> Iterator[Case]:
         rng, bound = np.random.default_rng(limit), math.radians(limit)
         theta = rng.uniform(configured.low, configured.high, (count, 4))
         tilts = [Tilt.of(configured.side, *tilt) for tilt in rng.uniform(-bound, bound, (count, 2)).tolist()]
-        yield Case(cog, "random", limit, configured.papers, theta, tilts)
+        yield Case(cog, "random", limit, configured.paper_arm, theta, tilts)
 
 
 def _upright(cog: str, configured: ConfiguredArm, axes: Sequence[np.ndarray]) -> Case:
     """Return every combination of the angles `axes` of joints 2 to 4, with the trunk upright."""
     theta = np.array(list(product((0.0,), *axes)))
-    return Case(cog, "workspace", 0, configured.papers, theta, [Tilt.of(configured.side)] * len(theta))
+    return Case(cog, "workspace", 0, configured.paper_arm, theta, [Tilt.of(configured.side)] * len(theta))
 
 
 def compare(case: Case, torque: dict[str, np.ndarray], reference: str, expected: np.ndarray) -> Iterator[Row]:
@@ -113,8 +113,8 @@ class Part:
 
 def evaluate(cog: str, configured: ConfiguredArm, count: int) -> Part:
     """Compare all laws with all references over the workspace and `count` random poses per tilt limit."""
-    references = {name: build(configured.papers) for name, build in REFERENCES.items()}
-    law, trained = train_law(from_gravload(configured), configured.papers)
+    references = {name: build(configured.paper_arm) for name, build in REFERENCES.items()}
+    law, trained = train_law(from_gravload(configured), configured.paper_arm)
     rows: list[Row] = []
     runs = list(cases(cog, configured, count))
     for case in track(runs, f"comparing, CoGs {cog}", console=Console(stderr=True), transient=True):

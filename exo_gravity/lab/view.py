@@ -13,7 +13,7 @@ a second, smaller arc, which spans `SIZES.torque_span` at the joint's torque lim
 """
 
 import math
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 from xml.etree import ElementTree
@@ -30,7 +30,7 @@ from exo_gravity.core.numbers import JOINT_COUNT, Vector
 from exo_gravity.core.params import Param
 from exo_gravity.core.safety.drive import CARRYING, State
 from exo_gravity.core.safety.limits import WALL, Limits, limits_of
-from exo_gravity.hardware.urdf_arm import UrdfArm, arm_in_file
+from exo_gravity.hardware.urdf_arm import arm_in_file
 
 Point = tuple[float, ...]  # (3,)
 
@@ -66,8 +66,8 @@ GREY, BLUE = (0.60, 0.60, 0.60, 1.0), (0.20, 0.45, 0.85, 1.0)
 
 
 @dataclass(frozen=True, eq=False)
-class PapersPicture:
-    """The paper's arm on a trunk, with what is drawn of an arm from a URDF."""
+class OnTrunk:
+    """The paper's arm on a trunk, in the trunk's axes, as `UrdfArm` is."""
 
     side: str  #: 'left' or 'right'
     robot: ArmModel  #: without a wearer
@@ -119,7 +119,13 @@ class Described:
     """What a description, and a picture, states about one arm of n joints."""
 
     side: str  #: 'left' or 'right'
-    robot: PapersPicture | UrdfArm
+    #: where the arm is at theta (n,) rad, in the trunk's axes: the origins (n + 1, 3) in m of the joints and the far
+    #: end, the axes (n, 3) about which the joints turn, and unit vectors (n, 3) along the links, as far as these are
+    #: across the axes
+    pose: Callable[[Sequence[float]], tuple[np.ndarray, np.ndarray, np.ndarray]]
+    #: mass (n,) in kg and centre of gravity (n, 3) in m of each link, from its joint, in the same axes, while all
+    #: angles are 0; raises ParameterError if a link of the paper's arm has no mass
+    bodies: Callable[[], tuple[np.ndarray, np.ndarray]]
     limits: Limits  #: names, position, speed and torque limits of the joints
     damping: Vector = (0.0,) * JOINT_COUNT  #: (n,) Nm s/rad, 0 for unknown
     friction: Vector = (0.0,) * JOINT_COUNT  #: (n,) Nm, 0 for unknown
@@ -135,22 +141,6 @@ class Described:
         """Origin of joint 1 in the trunk's axes, m."""
         return tuple(self.pose([0.0] * len(self.limits.joint_names))[0][0].tolist())
 
-    def pose(self, theta: Sequence[float]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Return where the arm is at `theta` (n,) rad, in the trunk's axes.
-
-        The origins (n + 1, 3) in m of the joints and the far end, the axes (n, 3) about which the joints turn, and unit
-        vectors (n, 3) along the links, as far as these are across the axes.
-        """
-        return self.robot.pose(theta)
-
-    def bodies(self) -> list[tuple[float, Point]]:
-        """Return mass in kg and centre of gravity (3,) in m of each link, from its joint, in the same axes.
-
-        Raises ParameterError if a link of the paper's arm has no mass.
-        """
-        masses, centres = self.robot.bodies()
-        return [(max(mass, LEAST_MASS), tuple(at)) for mass, at in zip(masses.tolist(), centres.tolist(), strict=True)]
-
 
 def described(compensator: Mapping[str, Any], can_bridge: Mapping[str, Any]) -> Described:
     """Return the arm that the parameters of its two nodes describe, or raise ParameterError."""
@@ -158,9 +148,10 @@ def described(compensator: Mapping[str, Any], can_bridge: Mapping[str, Any]) -> 
     if compensator["law"] == URDF_LAW:
         arm = arm_in_file(compensator, ", for a picture: the URDF on a topic is one already")
         at = arm.pose([0.0] * len(arm.names))[0][0]
-        return Described("left" if at[1] > 0.0 else "right", arm, limits, *friction)
+        return Described("left" if at[1] > 0.0 else "right", arm.pose, arm.bodies, limits, *friction)
     side, mass, shoulder = (compensator[name] for name in ("side", "robot.mass", "shoulder_from_imu"))
-    return Described(side, PapersPicture(side, robot_of(compensator), mass, shoulder), limits, *friction)
+    on_trunk = OnTrunk(side, robot_of(compensator), mass, shoulder)
+    return Described(side, on_trunk.pose, on_trunk.bodies, limits, *friction)
 
 
 def urdf(arms: Sequence[Described], meshes: str = "") -> str:
@@ -201,7 +192,8 @@ def _arm(arm: Described, names: Sequence[str], meshes: str) -> Iterator[Element]
     origins, axes, _ = arm.pose((0.0,) * len(names))
     vectors = np.diff(origins, axis=0).round(12)  # from each joint to the next
     parent, origin = ROOT, arm.base
-    for n, (mass, centre) in enumerate(arm.bodies()):
+    for n, (mass, place) in enumerate(zip(*arm.bodies(), strict=True)):
+        centre = tuple(place.tolist())
         end, length = tuple(vectors[n].tolist()), float(np.linalg.norm(vectors[n]))
         lower, upper = limits.position_min[n], limits.position_max[n]
         largest = {"effort": limits.max_effort[n], "velocity": limits.max_velocity[n]}
@@ -217,7 +209,7 @@ def _arm(arm: Described, names: Sequence[str], meshes: str) -> Iterator[Element]
             drawn.append(_visual("motor", "cylinder", end, axes[n + 1], **MOTOR))
         drawn.append(_visual("centre_of_gravity", "sphere", centre, radius=COG_RADIUS))
         is_sideways = abs(vectors[n][1]) > abs(vectors[n][2])
-        yield _link(arm.links[n], meshes, *drawn, inertial=_tube(mass, centre, length, is_sideways))
+        yield _link(arm.links[n], meshes, *drawn, inertial=_tube(max(mass, LEAST_MASS), centre, length, is_sideways))
         parent, origin = arm.links[n], end
     yield _joint(f"{arm.links[-1]}_joint", "fixed", parent, arm.links[-1], origin)
     yield _element("link", name=arm.links[-1])

@@ -44,7 +44,7 @@ def _run(options: argparse.Namespace) -> int:
         samples, ridge = from_bag(options.bag, configured, functions), RECORDED_RIDGE
     else:
         samples, ridge = from_gravload(configured), RIDGE
-    law, results = train_law(samples, configured.papers, functions, ridge)
+    law, results = train_law(samples, configured.paper_arm, functions, ridge)
     output.parent.mkdir(parents=True, exist_ok=True)
     output.write_text(text_of(law), encoding="utf-8")
     print(f"{law.source}; {law.model.rules} rules, {law.model.parameters} parameters per joint")

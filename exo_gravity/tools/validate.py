@@ -38,7 +38,7 @@ def _run(options: argparse.Namespace) -> int:
     output = Path(options.output)
     output.mkdir(parents=True, exist_ok=True)
     count = QUICK_COUNT if options.quick else COUNT
-    ends = replace(configured, robot=with_cog_at_link_ends(configured.papers))
+    ends = replace(configured, robot=with_cog_at_link_ends(configured.paper_arm))
     parts = evaluate(LINK_ENDS, ends, count), evaluate(CONFIGURED, configured, count)
     print(*tables(*parts), "", sep="\n")
     written = write(*parts, output)

@@ -83,7 +83,7 @@ def test_a_script_bends_the_elbow_and_one_for_another_number_of_joints_or_a_tool
     with pytest.raises(ParameterError, match=r"steps\[0\]\.move = .*: must be 3 numbers, one per joint"):
         simulated_trials(packaged_config("three_joints.yaml"), script_to([0.1, 0.2]))
     with pytest.raises(ParameterError, match="law = 'urdf': must be exact: this is for the paper's arm"):
-        read_arm(load(packaged_config("elbow.yaml")), "/right").papers  # noqa: B018
+        read_arm(load(packaged_config("elbow.yaml")), "/right").paper_arm  # noqa: B018
 
 
 # What docs/topics.md promises: the files of a47959f4 work unchanged, except that a person confirms the pose

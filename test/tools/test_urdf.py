@@ -27,7 +27,7 @@ from exo_gravity.lab.view import (
     SIZES,
     ArmView,
     Described,
-    PapersPicture,
+    OnTrunk,
     arm_shapes,
     described,
     gravity_shapes,
@@ -65,7 +65,8 @@ def by_pinocchio(text, joints, gravity):
 def description(side="left", **robot):
     values = {"length": (0.05, 0.13, 0.3, 0.3), "cog": (0.04, 0.1, 0.2, 0.15), "mass": (0.6, 0.5, 0.6, 0.2), **robot}
     arm = ArmModel.from_moments(**robot) if "first_moment" in robot else ArmModel(**values)
-    return Described(side, PapersPicture(side, arm, (0.6, 0.5, 0.6, 0.2)), Limits(NAMES))
+    on_trunk = OnTrunk(side, arm, (0.6, 0.5, 0.6, 0.2))
+    return Described(side, on_trunk.pose, on_trunk.bodies, Limits(NAMES))
 
 
 CALIBRATED = {
@@ -83,7 +84,7 @@ DESCRIBED = {  # the text, and the arms in it: side, joints, robot
         for name in ("exo.yaml", "sim_both.yaml")
     },
     **{
-        f"{case}, {side}": (urdf([one]), [(side, NAMES, one.robot.robot)])
+        f"{case}, {side}": (urdf([one]), [(side, NAMES, one.pose.__self__.robot)])
         for case, robot in CALIBRATED.items()
         for side in ("left", "right")
         for one in [description(side, **robot)]

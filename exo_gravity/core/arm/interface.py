@@ -37,6 +37,23 @@ class Payload(NamedTuple):
 NO_LOAD = Payload()
 
 
+class Frames(NamedTuple):
+    """Where the n joints of an arm are in m poses, how they and their links are turned, in the axes of its base."""
+
+    before: np.ndarray  #: (m, n, 3, 3) how the joints' frames would be turned with the joint itself at 0
+    after: np.ndarray  #: (m, n, 3, 3) how the links' frames are turned, in which their first moments are
+    places: np.ndarray  #: (m, n + 1, 3) m, where the joints are, and the hand, or the last joint again
+
+
+class Skeleton(NamedTuple):
+    """What `can_bridge` needs to compute the gravity of an arm of n joints itself, in the root link's axes."""
+
+    axes: np.ndarray  #: (n, 3), unit vectors along the joints' axes while all angles are 0; (0, 3): the paper's
+    ways: np.ndarray  #: (n, 3), unit vectors along the links, zeros for one without length; (0, 3): the paper's
+    moments: np.ndarray  #: (n,) kg m, largest first moment along each link, with all mass beyond it
+    beside: np.ndarray  #: (n,) kg m, largest first moment about each joint of masses off the links' axes
+
+
 class Links(Protocol):
     """The inertia of an arm's links, of what they hold, and of the rotors where these are known."""
 
@@ -114,6 +131,14 @@ class Arm(Protocol):
     @property
     def facts(self) -> Mapping[str, Sequence[float] | None]:
         """What is known of the arm itself, by name and unit, for /diagnostics; None for what is not known."""
+        ...
+
+    def frames(self, theta: np.ndarray) -> Frames:
+        """Return where the arm is at `theta` (m, n) rad."""
+        ...
+
+    def skeleton(self) -> Skeleton | None:
+        """Return axes, links and largest moments of all that the arm holds; None if its joints are no single chain."""
         ...
 
     def with_masses(self, law: str) -> Any:

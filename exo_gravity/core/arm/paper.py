@@ -34,7 +34,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from exo_gravity.core.arm.chain import Body, ChainInertia
+from exo_gravity.core.arm.chain import Body, ChainInertia, frames
 from exo_gravity.core.arm.interface import (
     MAX_GAIN,
     MAX_GRAVITY,
@@ -43,7 +43,9 @@ from exo_gravity.core.arm.interface import (
     MAX_REACH,
     NO_LOAD,
     STANDARD_GRAVITY,
+    Frames,
     Payload,
+    Skeleton,
 )
 from exo_gravity.core.arm.rotation import ZERO
 from exo_gravity.core.arm.tilt import Tilt, turning_in_base
@@ -261,6 +263,24 @@ class ArmModel:
     def worn_links(self, mass: Vector, cog: Vector) -> ChainInertia:
         """Return the inertia with the wearer's segments, (4,) kg at (4,) m along their links, as rods of their own."""
         return self.links.joined_with(ArmModel(self.length, cog, mass).links)
+
+    def frames(self, theta: np.ndarray) -> Frames:
+        """Return where the arm is at `theta` (m, 4) rad, in the arm's base frame; the hand is the end of link 4.
+
+        Frames are those of Table 1: a joint has that of the link before.
+        """
+        each = [frames(self.length.tolist(), pose) for pose in theta.tolist()]
+        links = np.reshape(each, (-1, JOINT_COUNT, 5, 3))
+        after, base = np.swapaxes(links[:, :, 2:], 2, 3), np.broadcast_to(np.eye(3), (len(links), 1, 3, 3))
+        hand = links[:, 3:, 0] + self.length[3] * links[:, 3:, 2]
+        places = np.concatenate((links[:, :, 0], hand), axis=1)
+        return Frames(np.concatenate((base, after[:, :-1]), axis=1), after, places)
+
+    def skeleton(self) -> Skeleton:
+        """Return the largest moments; axes and links are what `can_bridge` assumes."""
+        w, z, y3, y4 = map(abs, self.off_axis)
+        beside = np.array((w + z + y3 + y4, z + y3 + y4, y3 + y4, y4))
+        return Skeleton(np.empty((0, 3)), np.empty((0, 3)), np.array(self.first_moment), beside)
 
     @property
     def facts(self) -> Mapping[str, Sequence[float] | None]:

@@ -1,36 +1,41 @@
 # Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
 """What a calibration needs of an arm: its torque, linear in k moments, and which of them it takes for known.
 
-The paper's arm has the eight moments of `core.arm.paper`; any other those of `UrdfArm.base`, which a QR decomposition
-of its regressor leaves. Both are first moments in kg m.
+The torque follows from where the arm's joints are and how they turn (`Arm.frames`). The paper's arm has the eight
+moments of `core.arm.paper`; any other those which a QR decomposition of its regressor leaves. Both are first moments of
+links, in kg m.
 """
 
 import itertools
 from collections.abc import Callable, Mapping, Sequence
-from functools import cached_property, lru_cache
+from copy import copy
+from functools import cached_property
 from operator import attrgetter
 from typing import Any, NamedTuple
 
 import numpy as np
 
-from exo_gravity.core.arm.interface import MAX_MASS, Arm, Links
-from exo_gravity.core.arm.paper import MAX_LENGTH
+from exo_gravity.core.arm.interface import MAX_MASS, Arm
+from exo_gravity.core.arm.paper import MAX_LENGTH, ArmModel
 from exo_gravity.core.arm.tilt import SIDES, Tilt
 from exo_gravity.core.compensation.laws import URDF_LAW
 from exo_gravity.core.compensation.settings import WORN_MOMENTS, robot_of
 from exo_gravity.core.errors import ParameterError
 from exo_gravity.core.motors.families import MOTORS
-from exo_gravity.core.numbers import one_float
-from exo_gravity.hardware.urdf_arm import UrdfArm, arm_in_file
-from exo_gravity.lab.moments import MOMENTS, PapersChain, chain_of
+from exo_gravity.core.numbers import JOINT_COUNT, one_float
+from exo_gravity.hardware.urdf_arm import MOMENT_NAMES, TURN_NAMES, UrdfArm, arm_in_file
 
 # deg of each joint, within the paper's ranges: from these a missing pose is suggested.
 GRID = ((-60, 0, 60), (15, 45, 75, 105, 135), (-30, 0, 30, 60, 90, 120), (0, 30, 60, 90, 120, 150))
 TURNS = 3  # of a joint's place: about its axis, and about two directions across it
 SUGGESTED = 600  # poses at random, from which one is suggested for another arm
-FITTED = 60  # of them, in which the moments of an arm with turned axes are found
+FITTED = 60  # poses in which the moments of an arm are found from its torque
+DEPENDENT = 1e-6  # of the largest column: what is left of one that depends on others
 STEP = 10.0  # deg, of their angles
 LITTLE = 1e-6  # Nm per kg m: a joint that carries less carries nothing
+MOMENT_PARAMETERS = {"robot.first_moment": slice(JOINT_COUNT), "robot.off_axis": slice(JOINT_COUNT, None)}
+
+Base = Sequence[tuple[int, np.ndarray]]  # of each moment the link's number, and a unit vector (3,) in its frame
 
 
 class Kind(NamedTuple):
@@ -40,7 +45,6 @@ class Kind(NamedTuple):
     #: moments of the links, and axes that are askew. Else the file holds the moments, and a fit begins without such.
     is_described: bool = True
     down: Callable[[Tilt], Sequence[float]] = attrgetter("gravity_in_trunk")  #: gravity's direction in the base frame
-    worn: tuple[str, ...] = WORN_MOMENTS  #: parameters of a wearer's moments
     worn_along: tuple[int, ...] = ()  #: numbers of those moments of a wearer that must each be plausible
     at_least_0: tuple[int, ...] = ()  #: numbers of the moments that are 0 where they seem to be less
     above_0: tuple[int, ...] = ()  #: those that must be above 0, and known
@@ -53,7 +57,6 @@ class Kind(NamedTuple):
 PAPERS = Kind(
     is_described=False,
     down=attrgetter("direction"),
-    worn=("wearer.first_moment", "wearer.off_axis"),
     worn_along=(2, 3),
     at_least_0=(0,),
     above_0=(1, 2, 3),
@@ -87,7 +90,7 @@ def turned_by(
 
 
 class MomentModel:
-    """An arm whose moments are unknown.
+    """The paper's arm, whose moments are unknown; `DescribedModel` is another one.
 
     arm: of which the moments are known so far; its gains do not count.
     uses_imu: whether an IMU measures gravity's direction, whose mounting is corrected by what a fit finds.
@@ -96,37 +99,59 @@ class MomentModel:
     count, names, moments: n joints; of the k moments their names, and kg m as far as known.
     suggested: (m, n) rad, poses from which a missing one is taken.
     shows_tilt: whether gravity's direction is fitted, too: its turn is also one of the first joint's place.
-
-    Raises ParameterError if a joint that is not the arm's moves its links, or one of them follows another.
     """
 
+    kind = PAPERS
+    names: tuple[str, ...] = ("M1", "M2", "M3", "M4", "W", "Z", "Y3", "Y4")
+    #: link, and direction in its frame, of each moment: x of M1 to M4, z of W and Z, y of Y3 and Y4
+    base: Base = tuple(zip((0, 1, 2, 3, 0, 1, 2, 3), np.eye(3)[[0, 0, 0, 0, 2, 2, 1, 1]], strict=True))
+    directions = np.eye(3)[[0] * JOINT_COUNT]  #: of the links, in their frames
+    #: about which each joint's place turns, in its own frame: its axis, and two directions across it
+    turns = np.tile(np.eye(3)[[2, 0, 1]], (JOINT_COUNT, 1, 1))
+    moved_by = np.tri(JOINT_COUNT, dtype=bool).T  #: whether a joint, the first index, moves the link of another
+
     def __init__(self, arm: Arm, uses_imu: bool, rotors: Sequence[float] = ()) -> None:
-        self.arm = chain_of(arm)
-        self.kind = PAPERS if isinstance(self.arm, PapersChain) else Kind()
-        self.gravity, self.moments, self.count = self.arm.gravity, self.arm.moments, len(self.arm.directions)
+        self.arm, self.gravity, self.count = arm, arm.gravity, len(self.directions)
         self.keeps_tilt, self.shows_tilt = uses_imu, uses_imu or not self.kind.is_described
         self._rotors = np.diag(rotors) if len(rotors) else np.zeros((self.count, self.count))
-        self._inertia = lru_cache(4)(self._links_with)
-        if isinstance(self.arm, PapersChain):
-            self.names: tuple[str, ...] = MOMENTS
-            self.suggested = np.radians(list(itertools.product(*GRID)))
-            return
-        if not self.arm.moves_alone:
-            listed = list(self.arm.names)
-            raise ParameterError("joint_names", listed, "all joints that move the arm's links, for a calibration")
-        numbers = [n for n, _ in self.arm.base]
-        self.names = tuple(f"{self.arm.names[n]} {numbers[:k].count(n) + 1}" for k, n in enumerate(numbers))
-        low, high = self.arm.ranges
-        poses = np.random.default_rng(1).uniform(low, high, (SUGGESTED, self.count))
-        self.suggested = np.radians(STEP * np.round(np.degrees(poses) / STEP))
+        self.moments = self.moments_of(arm)
+        self.suggested = self._suggested()
+
+    def _suggested(self) -> np.ndarray:
+        return np.radians(list(itertools.product(*GRID)))
+
+    def moments_of(self, arm: Any) -> np.ndarray:
+        """Return the moments (k,) in kg m of an arm with these joints, and of all that it holds."""
+        return np.asarray(arm.moments)
 
     def down(self, tilt: Tilt) -> np.ndarray:
         """Return gravity's unit vector (3,) in the base frame of the paper's arm, or the root link's axes."""
         return np.array(self.kind.down(tilt))
 
+    def along_axes(self, theta: np.ndarray) -> np.ndarray:
+        """Return the torque (m, n, k, 3) in Nm per kg m with gravity along each axis of the base, at `theta` (m, n)."""
+        link, _ = self._columns
+        axes, _, moments = self._turned(theta)
+        cross = np.cross(axes[:, :, None], moments[:, None])
+        return np.asarray(-self.gravity * cross * self.moved_by[:, link, None])
+
     def rows(self, theta: np.ndarray, direction: np.ndarray) -> np.ndarray:
         """Return the torque (m, n, k) in Nm per kg m at `theta` (m, n) rad. direction: (3,) or (m, 3)."""
-        return self.arm.regressor(theta, direction)
+        downs = np.broadcast_to(direction, (len(theta), 3))
+        return np.asarray((self.along_axes(theta) @ downs[:, None, :, None])[..., 0])
+
+    @cached_property
+    def _columns(self) -> tuple[np.ndarray, np.ndarray]:
+        """The links (k,) and directions (k, 3) of `base`."""
+        links, ways = zip(*self.base, strict=True)
+        return np.array(links), np.array(ways)
+
+    def _turned(self, theta: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Return axes (m, n, 3), turns (m, n, 3, 3) and directions of the moments (m, k, 3) in the base's axes."""
+        frames, (link, ways) = self.arm.frames(theta), self._columns
+        turns = self.turns @ np.swapaxes(frames.before, 2, 3)
+        moments = np.einsum("mkab,kb->mka", frames.after[:, link], ways)
+        return turns[:, :, 0], turns, moments
 
     @cached_property
     def upright(self) -> np.ndarray:
@@ -142,8 +167,17 @@ class MomentModel:
     def added(self, link: int) -> np.ndarray:
         """Return what 1 kg in the joint of a link, and 1 kg m on it along x, y, z, add to the moments, (4, k)."""
         each = np.eye(self.count)[link]
-        ways = [self.arm.with_wearer_moments(np.outer(each, way)) for way in np.eye(3)]
-        return np.array([one.moments - self.moments for one in (self.arm.with_wearer(each, 0.0 * each), *ways)])
+        mass = self.moments_of(self.arm.with_wearer(each, 0.0 * each)) - self.moments
+        return np.vstack((mass, self._by_links[link]))
+
+    @cached_property
+    def _by_links(self) -> np.ndarray:
+        """What 1 kg m of each link along each axis of its frame adds to the moments, (n, 3, k)."""
+        added = np.zeros((self.count, 3, len(self.names)))
+        for k, (link, way) in enumerate(self.base):
+            added[link, :, k] = way
+        added[1, 1, 4] = added[2, 2, 5] = added[3, 2, 5] = 1.0  # along the axis of W, and twice along that of Z
+        return added
 
     @cached_property
     def _on_last(self) -> np.ndarray:
@@ -155,22 +189,109 @@ class MomentModel:
         lever = one_float("load_lever", lever, 0.0, MAX_LENGTH, "m")
         if not mass:
             return np.zeros(len(self.names))
-        return np.asarray(mass * np.append(1.0, lever * self.arm.directions[-1]) @ self._on_last)
+        return np.asarray(mass * np.append(1.0, lever * self.directions[-1]) @ self._on_last)
 
     def load_beside(self, mass: float, lever: float) -> np.ndarray:
         """Return the change (k, 2) of these moments with the weight in the two directions across its link."""
         if not mass:
             return np.zeros((len(self.names), 2))
-        across = np.linalg.svd(self.arm.directions[-1:])[2][1:]
+        across = np.linalg.svd(self.directions[-1:])[2][1:]
         return np.asarray(mass * lever * (across @ self._on_last[1:]).T)
 
     def turned(self, theta: np.ndarray) -> np.ndarray:
         """Return the derivative (m, n, k, 3, 3 n) of `along_axes` by turns of the joints' places."""
-        before, after = self.arm.frames(theta)
-        link, ways = np.array([n for n, _ in self.arm.base]), np.array([way for _, way in self.arm.base])
-        moments = np.einsum("mkab,kb->mka", after[:, link], ways)
-        turns = np.einsum("mnab,ntb->mnta", before, self.arm.turns)
-        return self.gravity * turned_by(turns[:, :, 0], turns, moments, link, self.arm.moved_by)
+        link, _ = self._columns
+        return self.gravity * turned_by(*self._turned(theta), link, self.moved_by)
+
+    def in_file(self, moments: np.ndarray, turn: np.ndarray) -> dict[str, np.ndarray]:
+        """Return the compensator's parameters, (n,) each, that hold `moments` (k,) kg m as a fit found them.
+
+        turn: (n, 3) rad, of the joints' axes.
+        """
+        return {name: moments[part] for name, part in MOMENT_PARAMETERS.items()}
+
+    def worn(self, moments: np.ndarray) -> Arm:
+        """Return the arm with a wearer who adds `moments` (k,) kg m."""
+        along, across = (self.moments + moments).reshape(2, -1)
+        return ArmModel.from_moments(self.arm.length, along, across, gravity=self.gravity)
+
+    def worn_in_file(self, moments: np.ndarray) -> dict[str, np.ndarray]:
+        """Return the compensator's parameters, (n,) each, that hold what a wearer adds to the moments, (k,) kg m."""
+        return {"wearer.first_moment": moments[:JOINT_COUNT], "wearer.off_axis": moments[JOINT_COUNT:]}
+
+    def common(self, moments: np.ndarray) -> np.ndarray:
+        """Return what the joint shows that carries the moment with its own link."""
+        return np.array([moments[n, k] for k, (n, _) in enumerate(self.base)])
+
+    def matrix(self, theta: Sequence[float], load: tuple[float, float]) -> np.ndarray:
+        """Return the mass matrix (n, n) in kg m^2 of the arm as far as known, with the load as a point."""
+        mass, lever = load
+        matrix = self.arm.links.matrix(theta) + self._rotors
+        if not mass:
+            return matrix
+        frames = self.arm.frames(np.array([theta]))
+        axes = np.einsum("nab,nb->na", frames.before[0], self.turns[:, 0])
+        place = frames.places[0, -2] + lever * frames.after[0, -1] @ self.directions[-1]
+        ways = np.cross(axes, place - frames.places[0, :-1]) * self.moved_by[:, -1:]  # (n, 3) m, the point's per rad
+        return np.asarray(matrix + mass * ways @ ways.T)
+
+    def upwards(self, theta: np.ndarray) -> np.ndarray:
+        """Return the sine (m,) of the largest angle of a link above the horizontal of an upright trunk."""
+        ways = np.diff(self.arm.frames(theta).places, axis=1)[:, self.kind.rises_from :]
+        length, rise = np.linalg.norm(ways, axis=2), -ways @ self.down(Tilt.of(SIDES[0]))
+        return np.asarray(np.divide(rise, length, out=np.full_like(length, -1.0), where=length > 0.0).max(axis=1))
+
+
+class DescribedModel(MomentModel):
+    """An arm that a URDF describes, of n joints.
+
+    Raises ParameterError if a joint that is not the arm's moves its links, or one of them follows another.
+    """
+
+    kind = Kind()
+    arm: UrdfArm
+
+    def __init__(self, arm: UrdfArm, uses_imu: bool, rotors: Sequence[float] = ()) -> None:
+        if not arm.moves_alone:
+            listed = list(arm.names)
+            raise ParameterError("joint_names", listed, "all joints that move the arm's links, for a calibration")
+        self.directions, self.turns, self.moved_by = arm.directions, arm.turns, arm.moved_by
+        self.base = self._base_of(arm)
+        numbers = [n for n, _ in self.base]
+        self.names = tuple(f"{arm.names[n]} {numbers[:k].count(n) + 1}" for k, n in enumerate(numbers))
+        super().__init__(arm, uses_imu, rotors)
+
+    def _suggested(self) -> np.ndarray:
+        low, high = self.arm.ranges
+        poses = np.random.default_rng(1).uniform(low, high, (SUGGESTED, self.count))
+        return np.radians(STEP * np.round(np.degrees(poses) / STEP))
+
+    def _base_of(self, arm: UrdfArm) -> Base:
+        """Return the k moments that gravity's torque can show.
+
+        Of a link's first moment the part along its joint's axis turns with the link before, as masses do: both count as
+        the first moments of that link. The rest are columns of the regressor, from which a QR decomposition in random
+        poses leaves out those that depend on others (M. Gautier, ICRA 1990). The axes are those of the URDF, not turned
+        ones: axes that are nearly parallel show next to nothing more.
+        """
+        every, (masses, _) = copy(self), arm.bodies()
+        every.arm, every.gravity = arm.turned(0.0 * arm.turn), 1.0
+        every.base = [(n, way) for n in np.flatnonzero(masses).tolist() for way in self.turns[n, 1:]]
+        rows = every.rows(*_sampled(len(masses))).reshape(-1, len(every.base))
+        size = np.abs(np.diag(np.linalg.qr(rows, mode="r")))
+        return [one for one, own in zip(every.base, size, strict=True) if own > DEPENDENT * size.max()]
+
+    def moments_of(self, arm: UrdfArm) -> np.ndarray:
+        """Return the moments (k,) in kg m of an arm with these joints, and of all that it holds."""
+        poses, down = _sampled(self.count)
+        rows = self.rows(poses, down).reshape(-1, len(self.base))
+        return np.asarray(np.linalg.lstsq(rows, _needed(arm, poses, down).ravel(), rcond=None)[0])
+
+    @cached_property
+    def _by_links(self) -> np.ndarray:
+        ways = np.eye(3 * self.count).reshape(-1, self.count, 3)
+        added = [self.moments_of(self.arm.with_wearer_moments(way)) - self.moments for way in ways]
+        return np.reshape(added, (self.count, 3, -1))
 
     def found(self, arm: UrdfArm, moments: np.ndarray, turn: np.ndarray) -> UrdfArm:
         """Return `arm` with these `moments` (k,) kg m and `turn` (n, 3) rad of the joints' axes, as a fit found them.
@@ -178,42 +299,49 @@ class MomentModel:
         The turns about the axes are errors of the zeros, and not part of it. The fit has turned no moment along an
         axis: what that changes in an arm whose places are turned, the moments make up for.
         """
-        across = np.einsum("nt,ntb->nb", turn[:, 1:], arm.turns[:, 1:])
+        across = np.einsum("nt,ntb->nb", turn[:, 1:], self.turns[:, 1:])
         poses, down = self.suggested[:FITTED], np.eye(3)[np.arange(FITTED) % 3]
         askew = (turn * (0.0, 1.0, 1.0)).ravel()
         wanted = self.rows(poses, down) @ moments
         wanted += np.einsum("mnkat,ma,k,t->mn", self.turned(poses), down, moments, askew, optimize=True)
-        turned = arm.turned(arm.turn + across)
-        own = turned.torques(poses, [Tilt.of_gravity(SIDES[0], way).direction for way in down])
-        rows = turned.regressor(poses, down).reshape(-1, len(moments))
-        return turned.with_more_moments(np.linalg.lstsq(rows, (wanted - own).ravel(), rcond=None)[0])
+        new = copy(self)
+        new.arm = arm.turned(arm.turn + across)
+        rows = new.rows(poses, down).reshape(-1, len(moments))
+        more = np.linalg.lstsq(rows, (wanted - _needed(new.arm, poses, down)).ravel(), rcond=None)[0]
+        return new.arm.corrected(arm.change + self.in_links(more))
 
     def in_links(self, moments: np.ndarray) -> np.ndarray:
         """Return moments (k,) as first moments of the links, (n, 3) kg m along x, y, z of their frames."""
         in_links = np.zeros((self.count, 3))
-        for (link, way), moment in zip(self.arm.base, moments, strict=True):
+        for (link, way), moment in zip(self.base, moments, strict=True):
             in_links[link] += moment * way
         return in_links
 
-    def common(self, moments: np.ndarray) -> np.ndarray:
-        """Return what the joint shows that carries the moment with its own link."""
-        return np.array([moments[n, k] for k, (n, _) in enumerate(self.arm.base)])
+    def in_file(self, moments: np.ndarray, turn: np.ndarray) -> dict[str, np.ndarray]:
+        """Return the same: by what the first moments and places of the joints differ from the URDF's."""
+        new = self.found(self.arm, moments, turn)
+        values = (*new.change.T, *new.turn.T)
+        return dict(zip((*MOMENT_NAMES, *TURN_NAMES), values, strict=True))
 
-    def matrix(self, theta: Sequence[float], load: tuple[float, float]) -> np.ndarray:
-        """Return the mass matrix (n, n) in kg m^2 of the arm as far as known, with the load."""
-        return self._inertia(*load).matrix(theta) + self._rotors
+    def worn(self, moments: np.ndarray) -> Arm:
+        """Return the arm with a wearer who adds `moments` (k,) kg m."""
+        return self.arm.with_wearer_moments(self.in_links(moments))
 
-    def _links_with(self, mass: float, lever: float) -> Links:
-        if not mass:  # a point on the last link would take the place of a wearer
-            return self.arm.links
-        none = [0.0] * (self.count - 1)
-        return self.arm.worn_links([*none, mass], [*none, lever])
+    def worn_in_file(self, moments: np.ndarray) -> dict[str, np.ndarray]:
+        """Return the same along x, y and z of the links."""
+        return dict(zip(WORN_MOMENTS, self.in_links(moments).T, strict=True))
 
-    def upwards(self, theta: np.ndarray) -> np.ndarray:
-        """Return the sine (m,) of the largest angle of a link above the horizontal of an upright trunk."""
-        ways = np.diff(self.arm.places(theta), axis=1)[:, self.kind.rises_from :]
-        length, rise = np.linalg.norm(ways, axis=2), -ways @ self.down(Tilt.of(SIDES[0]))
-        return np.asarray(np.divide(rise, length, out=np.full_like(length, -1.0), where=length > 0.0).max(axis=1))
+
+def _sampled(count: int) -> tuple[np.ndarray, np.ndarray]:
+    """Return poses (m, n) in rad at random of an arm of `count` joints, each with a vector of gravity (m, 3)."""
+    random = np.random.default_rng(1)
+    return random.uniform(-np.pi, np.pi, (FITTED, count)), random.normal(size=(FITTED, 3))
+
+
+def _needed(arm: UrdfArm, poses: np.ndarray, down: np.ndarray) -> np.ndarray:
+    """Return the torque (m, n) in Nm at `poses` (m, n) rad; down: (m, 3), gravity in the root link's axes."""
+    x, y, z = down.T
+    return arm.torques(poses, np.stack((y, x, -z), axis=1))
 
 
 def model_of(values: Mapping[str, Any], worn: tuple[Sequence[float], Sequence[float]] | None = None) -> MomentModel:
@@ -224,18 +352,11 @@ def model_of(values: Mapping[str, Any], worn: tuple[Sequence[float], Sequence[fl
 
     Raises ParameterError, also if the URDF comes from a topic.
     """
-    robot: Arm
     if values["law"] == URDF_LAW:
         own = arm_in_file(values, ": a calibration does not wait for a topic")
-        robot = own.scaled([1.0] * len(own.names), values["gravity"])
+        described = own.scaled([1.0] * len(own.names), values["gravity"])
         rotors = [MOTORS[name].rotor_inertia for name in values["motor"]]
-    else:
-        robot, rotors = robot_of(values), []
-    if worn:
-        robot = robot.with_wearer(*worn)
-    return MomentModel(robot, values["use_imu"], rotors)
-
-
-def along_axes(model: MomentModel, theta: np.ndarray) -> np.ndarray:
-    """Return the torque (m, n, k, 3) in Nm per kg m with gravity along each axis of the base frame."""
-    return np.stack([model.rows(theta, axis) for axis in np.eye(3)], axis=-1)
+        return DescribedModel(described.with_wearer(*worn) if worn else described, values["use_imu"], rotors)
+    robot = robot_of(values)
+    bare = ArmModel.from_moments(robot.length, robot.first_moment, robot.off_axis, gravity=robot.gravity)
+    return MomentModel(bare.with_wearer(*worn) if worn else bare, values["use_imu"])

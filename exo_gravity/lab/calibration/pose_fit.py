@@ -26,7 +26,7 @@ from typing import NamedTuple
 import numpy as np
 
 from exo_gravity.core.errors import DataError
-from exo_gravity.lab.calibration.moment_model import TURNS, MomentModel, along_axes
+from exo_gravity.lab.calibration.moment_model import TURNS, MomentModel
 from exo_gravity.lab.calibration.tracking import Observation
 
 TURN = np.cross(np.eye(3), np.eye(3)[:, None])  # (3, 3, 3): v @ TURN has the rows v x X, v x Y and v x Z
@@ -232,7 +232,7 @@ def rows_of(observations: Sequence[Observation], model: MomentModel, places: Pla
     turns = unit[at.turn] / np.maximum(turned_by, EXACT)[:, None]
     slopes = unit[at.slope] / FIT.slope_error
     anchor = np.vstack((unit[at.angle] / FIT.beside_error, tilt, scales, slopes, turns, product / EXACT))
-    along, sigma = along_axes(model, theta), np.hypot(spread, FIT.least_spread)
+    along, sigma = model.along_axes(theta), np.hypot(spread, FIT.least_spread)
     turned = model.turned(theta)
     temperature = temperatures(observations)
     warmth = np.nan_to_num(temperature - temperature.mean(axis=0))
@@ -245,7 +245,7 @@ def unmeasured(model: MomentModel, theta: np.ndarray, direction: np.ndarray, sta
 
     theta: (m, n) rad. direction: (m, 3). start: (count,).
     """
-    at, along, none = layout_of(model), along_axes(model, theta), np.zeros_like(theta)
+    at, along, none = layout_of(model), model.along_axes(theta), np.zeros_like(theta)
     turned, load = np.zeros((*along.shape, TURNS * model.count)), np.zeros((len(theta), at.moments))
     beside = np.zeros((*load.shape, 2))
     return Rows(along, turned, theta, none, direction, load, beside, none, none, at, start, np.zeros((0, at.count)))

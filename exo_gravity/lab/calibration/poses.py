@@ -17,7 +17,7 @@ from exo_gravity.core.arm.tilt import Tilt
 from exo_gravity.core.errors import DataError
 from exo_gravity.core.numbers import Torque, Vector
 from exo_gravity.core.safety.limits import WALL, Limits
-from exo_gravity.lab.calibration.moment_model import MomentModel, along_axes
+from exo_gravity.lab.calibration.moment_model import MomentModel
 from exo_gravity.lab.calibration.pose_fit import layout_of, unmeasured
 from exo_gravity.lab.calibration.tracking import MOTION, Line, Observation, Station
 
@@ -91,7 +91,7 @@ class TorqueGuess:
         self.tilt = tilt
         self._mean = np.tile(np.append(moments, (0.0, 0.0)), (model.count, 1))  # of each joint: moments, offset, spring
         self._covariance = np.tile(np.diag(deviation**2), (model.count, 1, 1))
-        rows = np.moveaxis(along_axes(model, model.suggested), -1, 0)
+        rows = np.moveaxis(model.along_axes(model.suggested), -1, 0)
         self._rows = rows.reshape(-1, *rows.shape[2:])  # gravity from three sides, in all suggested poses
         self._begin(moments)
 
@@ -102,7 +102,8 @@ class TorqueGuess:
 
     def torque(self, theta: Sequence[float]) -> Torque:
         """Return the expected torque (n,) in Nm at `theta` (n,) rad, in plain floats for the control loop."""
-        gravity = self._hold(theta, self.tilt)
+        rows = self.model.rows(np.array([theta]), self.tilt.magnitude * self.model.down(self.tilt))[0]
+        gravity = np.einsum("nk,nk->n", rows, self._moments).tolist()
         return tuple(own + at + k * angle for own, (at, k), angle in zip(gravity, self._springs, theta, strict=True))
 
     def torques(self, theta: np.ndarray, direction: Vector | None = None) -> tuple[np.ndarray, np.ndarray]:
@@ -153,7 +154,7 @@ class TorqueGuess:
 
     def _update(self) -> None:
         """Take over the mean."""
-        self._hold, self._springs = self.model.arm.holding(self._moments), self._mean[:, -2:].tolist()
+        self._springs = self._mean[:, -2:].tolist()
         now = np.einsum("njk,jk->nj", self._rows, self._moments)
         least = len(self._rows) * PRIOR.unexplained**2  # of a joint that carries nothing
         strength = (np.sum(now * self._at_start, axis=0) + least) / (np.sum(self._at_start**2, axis=0) + least)

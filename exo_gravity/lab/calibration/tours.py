@@ -19,12 +19,12 @@ from exo_gravity.core.compensation.laws import URDF_LAW
 from exo_gravity.core.compensation.settings import ModelError, joint_spring_of
 from exo_gravity.core.errors import ParameterError
 from exo_gravity.core.motors.joint_motor import TORQUE_SCALE_BOUNDS, scale_at
-from exo_gravity.core.numbers import COVER, JOINT_COUNT, for_joints, one_float
-from exo_gravity.hardware.urdf_arm import MOMENT_NAMES, TURN_NAMES, UrdfArm
+from exo_gravity.core.numbers import COVER, for_joints, one_float
+from exo_gravity.hardware.urdf_arm import TURN_NAMES
 from exo_gravity.lab.calibration import live, moment_model
 from exo_gravity.lab.calibration.identification import Identified, fit_friction, identify
 from exo_gravity.lab.calibration.live import Say, tour_parameters
-from exo_gravity.lab.calibration.moment_model import MomentModel
+from exo_gravity.lab.calibration.moment_model import MOMENT_PARAMETERS, MomentModel
 from exo_gravity.lab.calibration.pose_fit import Places, columns, temperatures
 from exo_gravity.lab.calibration.poses import candidates, next_pose
 from exo_gravity.lab.calibration.recorded import observations_of
@@ -52,9 +52,6 @@ class CheckTour:
 
 
 CHECK = CheckTour()
-
-
-MOMENT_PARAMETERS = {"robot.first_moment": slice(JOINT_COUNT), "robot.off_axis": slice(JOINT_COUNT, None)}
 
 
 def calibrate_gravity(options: argparse.Namespace, arm: ConfiguredArm, say: Say) -> CalibrationResult:
@@ -180,17 +177,13 @@ def _moment_changes(arm: ConfiguredArm, model: MomentModel, found: Identified) -
     node, before, error = f"{arm.namespace}/compensator", model.moments, found.error
     unit = "as commanded; in kg m once a weight was hung" if found.relative else "kg m"
     moments = np.where(np.isfinite(error), found.in_file, before)
-    if isinstance(model.arm, UrdfArm):
-        known = f"{unit}, +-{np.max(error, where=np.isfinite(error), initial=0.0):.2g} at most"
-        new = model.found(model.arm, moments, found.turn)
-        for names, parts, what in ((MOMENT_NAMES, new.change, known), (TURN_NAMES, new.turn, "rad")):
-            for name, values in zip(names, parts.T, strict=True):
-                note = f"{what}, was {row(np.array(arm.compensator[name]))}"
-                yield Change(node, name, (values.round(5) + 0.0).tolist(), note)
-        return
-    for name, part in MOMENT_PARAMETERS.items():
-        note = f"{' '.join(model.names[part])} {unit}, +-{row(error[part])}, was {row(before[part])}"
-        yield Change(node, name, moments[part].round(5).tolist(), note)
+    known = f"{unit}, +-{np.max(error, where=np.isfinite(error), initial=0.0):.2g} at most"
+    for name, values in model.in_file(moments, found.turn).items():
+        if part := MOMENT_PARAMETERS.get(name):
+            note = f"{' '.join(model.names[part])} {unit}, +-{row(error[part])}, was {row(before[part])}"
+        else:
+            note = f"{'rad' if name in TURN_NAMES else known}, was {row(np.array(arm.compensator[name]))}"
+        yield Change(node, name, (values.round(5) + 0.0).tolist(), note)
 
 
 def _changes(arm: ConfiguredArm, model: MomentModel, found: Identified, scale: list[float]) -> tuple[Change, ...]:

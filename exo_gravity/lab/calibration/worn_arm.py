@@ -70,7 +70,7 @@ class WornArm:
         self.changes: Mapping[str, Any] = {"tour.wearer_mass": mass.tolist(), "tour.wearer_cog": cog.tolist()}
         self._links = np.flatnonzero(mass)
         self.to_moments = np.vstack([self.model.added(int(link)) for link in self._links]).T
-        self._expected = robot.with_wearer(mass, cog).moments - self.model.moments
+        self._expected = self.model.moments_of(robot.with_wearer(mass, cog)) - self.model.moments
         self.known = self._prior(mass, cog)
         home, low, high = np.array(arm.limits.home), arm.low, arm.high
         down, up = (np.clip(WORN.share * way, *WORN.reach) for way in (home - low, high - home))
@@ -81,7 +81,7 @@ class WornArm:
         """Return what is known before: the table's masses within a half, and their places within some centimetres."""
         rows, values = list[np.ndarray](), list[float]()
         for number, link in enumerate(self._links):
-            own, way = mass[link], self.model.arm.directions[link]
+            own, way = mass[link], self.model.directions[link]
             across = np.linalg.svd(way[None])[2][1:]
             block = np.zeros((4, self.to_moments.shape[1]))
             at = slice(4 * number, 4 * number + 4)
@@ -126,18 +126,15 @@ class WornArm:
         )
         node = f"{self._arm.namespace}/compensator"
         noted = f"kg m, +-{errors.max():.2g} at most" if kind.is_described else f"kg m, +-{row(errors)}"
-        parts = self.model.in_links(moments).T if kind.is_described else moments.reshape(len(kind.worn), -1)
-        changes = [
-            Change(node, parameter, (part.round(5) + 0.0).tolist(), noted)
-            for parameter, part in zip(kind.worn, parts, strict=True)
-        ]
+        parts = self.model.worn_in_file(moments).items()
+        changes = [Change(node, parameter, (part.round(5) + 0.0).tolist(), noted) for parameter, part in parts]
         if self._arm.compensator["law"] not in ("exact", URDF_LAW):
             changes.append(Change(node, "law", "exact", "the other laws need masses and centres of gravity"))
         return Found(moments, tuple(changes), compared, refusals)
 
     def allowed(self, moments: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return `largest_moment`, (n,) kg m, and the torque of what lies beside the links, (n,) Nm."""
-        skeleton = self.model.arm.with_wearer_moments(self.model.in_links(moments)).skeleton()
+        skeleton = self.model.worn(moments).skeleton()
         if skeleton is None:
             return np.zeros(self.model.count), np.zeros(self.model.count)
         return skeleton.moments, self.model.gravity * skeleton.beside

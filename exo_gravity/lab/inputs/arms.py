@@ -10,7 +10,7 @@ from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 
@@ -73,12 +73,12 @@ class ConfiguredArm:
         return bool(self.compensator["law"] == URDF_LAW)
 
     @property
-    def papers(self) -> ArmModel:
+    def paper_arm(self) -> ArmModel:
         """The robot, for what no other arm than the paper's has. Raises ParameterError."""
-        if not isinstance(self.robot, ArmModel):
+        if self.by_urdf:
             expected = "exact: this is for the paper's arm alone"
             raise ParameterError(f"{self.namespace}/compensator law", URDF_LAW, expected)
-        return self.robot
+        return cast(ArmModel, self.robot)
 
     @cached_property
     def settings(self) -> Settings:

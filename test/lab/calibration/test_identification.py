@@ -12,14 +12,13 @@ from exo_gravity.core.errors import DataError
 from exo_gravity.core.numbers import COVER
 from exo_gravity.lab.calibration.identification import check_physical, identify
 from exo_gravity.lab.calibration.imu import NO_HEADING, turn_in_trunk, turned, with_mounting
-from exo_gravity.lab.calibration.moment_model import MomentModel, along_axes
+from exo_gravity.lab.calibration.moment_model import MomentModel
 from exo_gravity.lab.calibration.pose_fit import Places
 from exo_gravity.lab.calibration.tours import moments_from
 from exo_gravity.lab.calibration.tracking import Observation
 from exo_gravity.lab.inputs.arms import configured_arm
 from exo_gravity.lab.inputs.parameter_file import packaged_config
 from exo_gravity.lab.inputs.references import ALPHA, OFFSET, pinocchio_model
-from exo_gravity.lab.moments import MOMENTS
 from exo_gravity.sim.arm import DEFAULT_LINKS
 
 from ...support.calibration_device import (
@@ -70,7 +69,7 @@ def test_the_prediction_of_a_pose_is_that_of_a_fit_without_it_and_nearly_as_good
     observations = Device(1).tour()
     found, without = identify(observations, PAPERS), identify(observations[1:], PAPERS)
     direction, theta = LEANING + np.cross(without.tilt, LEANING), np.array([observations[0].theta])
-    rows = (along_axes(PAPERS, theta) + PAPERS.turned(theta) @ without.turn.ravel())[0] @ direction
+    rows = (PAPERS.along_axes(theta) + PAPERS.turned(theta) @ without.turn.ravel())[0] @ direction
     predicted = rows @ without.moments / without.scale + without.offset
     np.testing.assert_allclose(found.held_out[0], observations[0].effort - predicted, atol=2e-3)
 
@@ -100,7 +99,7 @@ def test_with_an_upright_stand_joint_1_is_not_known_and_said_to_be():
     device = Device(4)
     found = identify(device.tour(UPRIGHT), PAPERS)
     assert "M1, W, torque scale 1: joint 1 carries nothing" in found.unknown[0]
-    unseen = [MOMENTS.index("M1"), MOMENTS.index("W")]
+    unseen = [PAPERS.names.index("M1"), PAPERS.names.index("W")]
     assert np.all(np.isinf(found.error[unseen])) and np.isinf(found.scale_error[0])
     seen = [k for k in range(8) if k not in unseen]
     assert np.all(np.abs(found.moments - device.moments)[seen] < 4.0 * found.error[seen])
@@ -211,7 +210,7 @@ def test_what_a_mass_anywhere_on_a_link_adds_to_the_moments_is_pinocchios(link):
 def test_the_papers_derivatives_by_turns_are_pinocchios():
     pin, model = pinocchio_model(DEFAULT_LINKS)
     moments, changed = MomentModel(DEFAULT_LINKS, True), np.zeros(8)
-    for link, way in moments.arm.base[4:]:  # W, Z, Y3 and Y4
+    for link, way in moments.base[4:]:  # W, Z, Y3 and Y4
         with_point(model, link, 0.05 * way)
         changed += np.append(1.0, 0.05 * way) @ moments.added(link)
     data, theta, step = model.createData(), np.array((0.4, 0.9, -0.3, 0.8)), 1e-5
