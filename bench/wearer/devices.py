@@ -76,7 +76,7 @@ def relaxed_poses() -> tuple[tuple[float, ...], ...]:
     low, high = np.maximum(ARM.low, PAPERS.comfortable[0]), np.minimum(ARM.high, PAPERS.comfortable[1])
     limits = replace(ARM.limits, position_min=low.tolist(), position_max=high.tolist())
     poses, taken = candidates(limits, MODEL), [hanging(limits).theta]
-    expected = ARM.papers.with_wearer(*Wearer(sum(BODY_MASS) / 2.0).on_links(LENGTH)).moments
+    expected = ARM.paper_arm.with_wearer(*Wearer(sum(BODY_MASS) / 2.0).on_links(LENGTH)).moments
     while len(taken) < WEARER.poses:
         best = next_pose(taken, poses, UPRIGHT, expected, MODEL)
         taken.append(tuple(poses[best].tolist()))

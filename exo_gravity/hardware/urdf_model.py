@@ -211,6 +211,7 @@ class UrdfShape:
             raise ParameterError("urdf.hand", hand, f"a link of the URDF ({links})")
         self._hand = hand
         self._joints = [self._model.getJointId(name) for name in names]
+        self._parents = [self._model.parents[joint] for joint in self._joints]
         self._axes = self._axes_of_joints()
         self._along = self._ways()
         self.length = tuple(np.linalg.norm(self._along, axis=1).tolist())
@@ -292,10 +293,9 @@ class UrdfShape:
 
     def skeleton(self) -> Skeleton | None:
         """Return axes, links and largest moments of all that the arm holds; None if its joints are no single chain."""
-        parents = [self._model.parents[joint] for joint in self._joints]
-        if not self.moves_alone or parents[1:] != self._joints[:-1]:
+        if not self.moves_alone or self._parents[1:] != self._joints[:-1]:
             return None
-        turns, ways = self.frames(np.zeros((1, len(parents)))).after[0], self.directions
+        turns, ways = self.frames(np.zeros((1, len(self._joints)))).after[0], self.directions
         links = [self._model.inertias[joint] for joint in self._joints]
         beyond = np.multiply(self.length, self.masses - [link.mass for link in links])
         own = np.array([link.mass * link.lever for link in links]) + beyond[:, None] * ways
@@ -311,8 +311,7 @@ class UrdfShape:
             self._pin.forwardKinematics(model, data, at)
             frames.append([place.homogeneous for place in data.oMi])
         places = np.reshape(frames, (-1, model.njoints, 4, 4))[..., :3, :]
-        parents = [model.parents[joint] for joint in self._joints]
-        turned = places[:, parents, :, :3] @ [model.jointPlacements[joint].rotation for joint in self._joints]
+        turned = places[:, self._parents, :, :3] @ [model.jointPlacements[joint].rotation for joint in self._joints]
         turns, origins = places[:, self._joints, :, :3], places[..., 3][:, self._joints]
         hand = origins[:, -1:] + turns[:, -1:] @ self._along[-1]
         return Frames(turned, turns, np.concatenate((origins, hand), axis=1))

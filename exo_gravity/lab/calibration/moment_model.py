@@ -137,8 +137,10 @@ class MomentModel:
 
     def rows(self, theta: np.ndarray, direction: np.ndarray) -> np.ndarray:
         """Return the torque (m, n, k) in Nm per kg m at `theta` (m, n) rad. direction: (3,) or (m, 3)."""
-        downs = np.broadcast_to(direction, (len(theta), 3))
-        return np.asarray((self.along_axes(theta) @ downs[:, None, :, None])[..., 0])
+        link, _ = self._columns
+        axes, _, moments = self._turned(theta)
+        pulls = np.cross(np.reshape(direction, (-1, 1, 3)), moments)
+        return np.asarray(self.gravity * (axes @ np.swapaxes(pulls, 1, 2)) * self.moved_by[:, link])
 
     @cached_property
     def _columns(self) -> tuple[np.ndarray, np.ndarray]:
