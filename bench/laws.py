@@ -14,14 +14,12 @@ from exo_gravity.core.compensation.settings import COMPENSATOR, robot_of
 from exo_gravity.core.params import values_of
 from exo_gravity.hardware.urdf_arm import UrdfArm, read_urdf
 from exo_gravity.lab.calibration.moment_model import DescribedModel
-from exo_gravity.lab.calibration.poses import TorqueGuess
+from exo_gravity.lab.calibration.poses import guess_for
 from exo_gravity.lab.inputs.arms import read_arm
 from exo_gravity.lab.inputs.parameter_file import load, packaged_config
 from exo_gravity.lab.inputs.references import pinocchio_model, toolbox_robot
 
 from .table import Row, race
-
-URDF_ARMS = ("three_joints.yaml", "seven_joints.yaml")
 
 POSES = 100_000
 LOOP = 2_000  # of these poses, for the peers, which compute one pose per call
@@ -65,8 +63,8 @@ def measure_laws(quick: bool) -> Iterator[Row]:
     names = "Pinocchio in a loop", "Pinocchio's compiled loop, one thread", "Robotics Toolbox in a loop"
     for name, peer, count in zip(names, peers, (LOOP, POSES, LOOP // 100), strict=True):
         yield row(f"law, 100,000 poses, per pose: {name}", ours, peer, POSES, count)
-    for file in URDF_ARMS:
-        yield from _measure_urdf(file, blocks)
+    for file in ("three_joints.yaml", "seven_joints.yaml"):
+        yield from _measure_urdf(pin, file, blocks)
 
 
 def row(name: str, ours: list[float], peer: list[float], poses: int = 1, of_peer: int = 1) -> Row:
@@ -74,13 +72,11 @@ def row(name: str, ours: list[float], peer: list[float], poses: int = 1, of_peer
     return Row.of_values(name, np.multiply(1e6 / poses, ours).tolist(), np.multiply(1e6 / of_peer, peer).tolist(), "us")
 
 
-def _measure_urdf(file: str, blocks: int) -> Iterator[Row]:
+def _measure_urdf(pin: Any, file: str, blocks: int) -> Iterator[Row]:
     """Yield the rows of the arm from a URDF that a file in config describes.
 
     Single poses are timed as the control loop computes them, and as a calibration tour does, with moments per joint.
     """
-    import pinocchio as pin
-
     arm = cast(UrdfArm, read_arm(load(packaged_config(file)), "/right").settings.robot)
     model = pin.buildModelFromXML(read_urdf(load(packaged_config(file))["/right/compensator"]["urdf.file"]))
     model.gravity.linear = np.array((0.0, 0.0, -arm.gravity))
@@ -96,8 +92,7 @@ def _measure_urdf(file: str, blocks: int) -> Iterator[Row]:
     name = f"law of a URDF with {count} joints"
     yield row(f"{name}, 100,000 poses, per pose: Pinocchio in a loop", ours, peer, POSES, LOOP)
     theta, still, tilt = poses[0].tolist(), np.zeros(count), Tilt.of("left")
-    tour = DescribedModel(arm.scaled([1.0] * count, arm.gravity), uses_imu=True)
-    hold = TorqueGuess(tour, tour.moments, tilt).torque
+    hold = guess_for(DescribedModel(arm.scaled([1.0] * count, arm.gravity), uses_imu=True), tilt).torque
     np.testing.assert_allclose(hold(theta), np.divide(arm.torque(theta, tilt), arm.gain), atol=1e-9)
     loop_pose, peer, tour_pose, regressor = race(
         (

@@ -227,15 +227,11 @@ class MomentModel:
 
     def matrix(self, theta: Sequence[float], load: tuple[float, float]) -> np.ndarray:
         """Return the mass matrix (n, n) in kg m^2 of the arm as far as known, with the load as a point."""
-        mass, lever = load
-        matrix = self.arm.links.matrix(theta) + self._rotors
-        if not mass:
-            return matrix
-        frames = self.arm.frames(np.array([theta]))
+        (mass, lever), frames = load, self.arm.frames(np.array([theta]))
         axes = np.einsum("nab,nb->na", frames.before[0], self.turns[:, 0])
         place = frames.places[0, -2] + lever * frames.after[0, -1] @ self.directions[-1]
         ways = np.cross(axes, place - frames.places[0, :-1]) * self.moved_by[:, -1:]  # (n, 3) m, the point's per rad
-        return np.asarray(matrix + mass * ways @ ways.T)
+        return np.asarray(self.arm.links.matrix(theta) + self._rotors + mass * ways @ ways.T)
 
     def upwards(self, theta: np.ndarray) -> np.ndarray:
         """Return the sine (m,) of the largest angle of a link above the horizontal of an upright trunk."""
