@@ -35,6 +35,7 @@ KEYS: Mapping[str, frozenset[str]] = {
     "weigh": ARM,  # what the hand holds; the compensator's diagnostics tell
     "bring_home": ARM,  # a simulated arm: its virtual wearer lets it hang
     "trial": frozenset({"name"}),
+    "open": frozenset({"name", "program"}),  # a recording, on this computer, by a browser on it
     "session": frozenset({"subject", "protocol", "note"}),
     **dict.fromkeys(("release", "record", "stop_recording", "save", "stop_trial", "keep_wearer"), frozenset()),
 }
@@ -66,8 +67,8 @@ def parse(body: Any, arms: Collection[str], trials: Collection[str]) -> dict[str
     arm, name = body.get("arm", ""), body.get("name", "")
     if "arm" in KEYS[kind] and arm not in arms and (kind != "let_down" or arm != ""):
         raise ParameterError("arm", arm, f"one of {', '.join(sorted(arms)) or 'none: no arm is present'}")
-    if kind == "trial" and (not isinstance(name, str) or name not in trials):
-        raise ParameterError("trial", name, f"one of {', '.join(sorted(trials))}")
+    if not isinstance(name, str) or (kind == "trial" and name not in trials):
+        raise ParameterError("name", name, f"one of {', '.join(sorted(trials))}" if kind == "trial" else "a text")
     if kind != "set":
         return dict(body)
     values = body.get("values") if isinstance(body.get("values"), dict) else {}
@@ -162,9 +163,10 @@ class Control:
         others = [self.arms.other_holder(arm, str(self.holder)) for arm in self.arms.names]
         return next(filter(None, others), "")
 
-    async def perform(self, body: Any, secret: str, address: str) -> tuple[int, str]:
+    async def perform(self, body: Any, secret: str, address: str, is_here: bool = False) -> tuple[int, str]:
         """Do what the JSON value `body` asks for, sent by the page with `secret`, at `address`.
 
+        is_here: whether that is a browser on this computer.
         Returns an HTTP status, and '' or what is wrong.
         """
         page = self._pages.get(secret)
@@ -180,6 +182,8 @@ class Control:
                 return self._answer(page, text, "another page holds control", 403)
             if arm and (other := self.arms.other_holder(arm, str(page))):
                 return self._answer(page, text, f"{other} holds control of this arm", 403)
+            if kind == "open" and not is_here:
+                return self._answer(page, text, "only a browser on the panel's computer opens programs there", 403)
         if kind in ("enable", "activate", "resume"):  # by a page that confirms nothing, the arm is not carried for long
             self.arms.lease(str(page), "hold")
         try:

@@ -11,7 +11,9 @@ import asyncio
 import contextlib
 import itertools
 import json
+import os
 import re
+import shutil
 from asyncio.subprocess import DEVNULL, PIPE
 from collections.abc import Callable
 from datetime import datetime
@@ -30,8 +32,24 @@ from exo_gravity.panel.view import OF_SUBJECT
 from exo_gravity.sim.script import TrialScript
 
 RECORDER, WEARER, REPORT = "/recorder", "wearer.yaml", "report.html"
+FILES = {"report": REPORT, "recording": "bag/*.mcap"}  # of a trial's folder that a page may open
 FOLDER_NAME = re.compile(r"(.+)_(\d{4})(\d\d)(\d\d)_(\d\d)(\d\d)(\d\d)(_\d+)?")  # of a recording or trial
 MOST_LISTED = 200  # recordings that the page lists
+# Programs that show a recording on this computer: the command of each, which the file follows.
+PROGRAMS = {"PlotJuggler": ["plotjuggler", "-d"], "Foxglove": ["foxglove-studio"]}
+
+
+def programs() -> dict[str, list[str]]:
+    """Return the commands of those PROGRAMS that are installed; none without a screen.
+
+    ROS installs its PlotJuggler outside PATH.
+    """
+    if not (os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")):
+        return {}
+    prefixes = filter(None, os.environ.get("AMENT_PREFIX_PATH", "").split(os.pathsep))
+    folders = (os.environ.get("PATH", ""), *(f"{prefix}/lib/plotjuggler" for prefix in prefixes))
+    found = {name: shutil.which(words[0], path=os.pathsep.join(folders)) for name, words in PROGRAMS.items()}
+    return {name: [path, *PROGRAMS[name][1:]] for name, path in found.items() if path}
 
 
 class Recordings:
@@ -134,9 +152,13 @@ class Recordings:
         guided = not any(node.endswith("/simulator") for node in self._device.parameters())
         attach = ("--attach", "guided" if guided else "simulated", "--output", str(self._output))
         words = [str(path), *attach, *(f"--{key}={text}" for key, text in self._present.items())]
-        trial = program("exo_gravity.tools.trial", "trial")
         self._trial = await asyncio.create_subprocess_exec(
-            *trial, *words, stdin=DEVNULL, stdout=PIPE, stderr=PIPE, start_new_session=True
+            *program("exo_gravity.tools.trial", "trial"),
+            *words,
+            stdin=DEVNULL,
+            stdout=PIPE,
+            stderr=PIPE,
+            start_new_session=True,
         )
         steps = [{"action": s.action, "value": list(s.value), "duration": s.duration} for s in script.steps]
         self._progress = {"phase": "running", "name": script.name, "guided": guided, "steps": steps, "step": -1}
@@ -228,6 +250,19 @@ class Recordings:
         with contextlib.suppress(OSError, ValueError):  # none was written, or only a part
             said |= json.loads((path / "report.json").read_text(encoding="utf-8"))
         return {**said, "report": self._key(path, REPORT), "folder": self._key(path, "bag")}
+
+    async def open(self, name: str, program: str) -> str:
+        """Show a recording of the list in one of `programs`, which outlives the panel."""
+        if not {*self._device.states().values()} <= {State.DISABLED.value, State.FAULT.value}:
+            # Such a program may load the computer that carries them.
+            return "a program is started while every arm is off"
+        command, listed = programs().get(str(program)), [entry["folder"] for entry in self.past()["past"]]
+        path = self.file(name, FILES["recording"]) if name and name in listed else None
+        if not (command and path):
+            raise ParameterError("name, program", [name, program], "a recording of the list and an installed program")
+        words = ("setsid", "--fork", *command, str(path))
+        starter = await asyncio.create_subprocess_exec(*words, stdin=DEVNULL, stdout=DEVNULL, stderr=DEVNULL)
+        return "" if await starter.wait() == 0 else f"{program} could not be started"
 
     def file(self, name: str, pattern: str) -> Path | None:
         """Return the first file of that pattern in the folder `name` below `output`; None without one."""

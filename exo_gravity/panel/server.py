@@ -40,6 +40,7 @@ from starlette.websockets import WebSocket, WebSocketDisconnect
 
 from exo_gravity.core.errors import ExoGravityError, ParameterError
 from exo_gravity.panel.control import Control, Page
+from exo_gravity.panel.recordings import FILES, programs
 
 FOLDER = Path(__file__).parent
 
@@ -61,7 +62,6 @@ SERVING = Serving()
 
 NOT_KNOWN: Mapping[str, Any] = {}
 FULL, REPLACED = 4000, 4001  # why a live connection was closed: too many pages; the page was opened again
-FILES = {"report": "report.html", "recording": "bag/*.mcap"}  # of a trial's folder that a page may open
 COOKIE = "exo_gravity_panel"
 # Nothing from elsewhere, no inline script or style, and no frame around the page, in which a press could be stolen.
 CONFINED = (
@@ -91,7 +91,12 @@ class PanelServer:
             Route("/strings", lambda request: FileResponse(FOLDER / "strings.json")),
             Route("/action", self._on_action, methods=["POST"]),
             *(Route(f"/{kind}/{{name:path}}", partial(self._on_file, pattern)) for kind, pattern in FILES.items()),
-            Route("/sessions", lambda request: JSONResponse(control.files.past())),
+            Route(
+                "/sessions",
+                lambda request: JSONResponse(
+                    {**control.files.past(), "programs": list(programs()) if is_here(request) else []}
+                ),
+            ),
             Route("/settings/{arm:path}", self._on_settings),
             Route("/parameters", lambda request: JSONResponse(control.arms.parameters())),
             WebSocketRoute("/live", self._on_live),
@@ -168,7 +173,7 @@ class PanelServer:
         except (ValueError, RecursionError):  # the latter of brackets in brackets
             return JSONResponse({"error": "the request is not JSON"}, 400)
         secret = request.headers.get("x-panel-page", "")
-        status, text = await self._control.perform(content, secret, address_of(request))
+        status, text = await self._control.perform(content, secret, address_of(request), is_here(request))
         return JSONResponse({"error": text}, status)
 
     async def _on_settings(self, request: Request) -> Response:
@@ -182,7 +187,11 @@ class PanelServer:
             return JSONResponse({"error": str(error)}, 503)
 
     async def _on_login(self, request: Request) -> Response:
-        return await self.access.login(request) if request.method == "POST" else RedirectResponse("/")
+        """Answer the form that asks for the token."""
+        if request.method != "POST":
+            return RedirectResponse("/")
+        form = parse_qs((await request.body()).decode("utf-8", "replace"))
+        return self.access.opened_by(form.get("token", [""])[0], request)
 
     async def _on_file(self, pattern: str, request: Request) -> Response:
         name = request.path_params["name"]
@@ -231,11 +240,6 @@ class Access:
 
         await (self._refusal(HTTPConnection(scope)) or self._app)(scope, limited, confined)
 
-    async def login(self, request: Request) -> Response:
-        """Answer the form that asks for the token."""
-        given = parse_qs((await request.body()).decode("utf-8", "replace")).get("token", [""])[0]
-        return self._opened_by(given, request)
-
     def is_token(self, given: str, address: str) -> bool:
         """Return whether `given` is the token, in constant time, and note a wrong one of `address`.
 
@@ -254,7 +258,7 @@ class Access:
         """Return the answer to a request that must not pass, None if it may."""
         scope, headers = connection.scope, connection.headers
         host = headers.get("host", "")
-        if self.is_open and not is_loopback(re.sub(r":\d*$", "", host).strip("[]")):
+        if self.is_open and not names_loopback(connection):
             return PlainTextResponse("403: the panel answers on loopback only: see docs/operating.md", 403)
         changes = scope.get("method") not in ("GET", "HEAD")  # a live connection has no method
         origins = (f"http://{host.lower()}", f"https://{host.lower()}") if host else ()
@@ -263,9 +267,9 @@ class Access:
         is_login = (scope["path"], scope.get("method")) == ("/login", "POST")
         if self.is_open or is_login or _equal(connection.cookies.get(COOKIE, ""), self._session):
             return None
-        return self._opened_by(connection.query_params.get("token", ""), connection)  # as the log shows it
+        return self.opened_by(connection.query_params.get("token", ""), connection)  # as the log shows it
 
-    def _opened_by(self, given: str, connection: HTTPConnection) -> Response:
+    def opened_by(self, given: str, connection: HTTPConnection) -> Response:
         """Return the session's cookie if `given` is the token, else the page that asks for it."""
         if not given or not self.is_token(given, address_of(connection)):
             note = "The token is wrong, or too many were tried: wait a minute." if given else ""
@@ -282,6 +286,16 @@ def is_loopback(host: str) -> bool:
         return host == "localhost" or ipaddress.ip_address(host).is_loopback
     except ValueError:
         return False
+
+
+def names_loopback(connection: HTTPConnection) -> bool:
+    """Return whether the client calls the panel by a name of this machine alone."""
+    return is_loopback(re.sub(r":\d*$", "", connection.headers.get("host", "")).strip("[]"))
+
+
+def is_here(connection: HTTPConnection) -> bool:
+    """Return whether the client is on this computer: behind a proxy, which is, it calls the panel by another name."""
+    return is_loopback(address_of(connection)) and names_loopback(connection)
 
 
 def address_of(connection: HTTPConnection) -> str:

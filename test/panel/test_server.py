@@ -1,11 +1,13 @@
 # Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
 """The web server over real connections: what it refuses, and what it sends."""
 
+import asyncio
 import json
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
+from unittest.mock import Mock
 
 import httpx
 import pytest
@@ -14,10 +16,11 @@ from websockets.exceptions import ConnectionClosed, InvalidStatus
 from websockets.sync.client import ClientConnection, connect
 
 from exo_gravity.core.errors import ParameterError
+from exo_gravity.panel.recordings import Recordings
 from exo_gravity.panel.server import SERVING, Access, PanelServer
 
 from ..support.panel_stage import Stage
-from ..support.waiting import PATIENCE
+from ..support.waiting import PATIENCE, wait_until
 
 
 def origin_of(stage: Stage) -> str:
@@ -165,6 +168,77 @@ def test_settings_are_read_when_they_are_asked_for_and_a_report_may_hold_styles_
     answer = get(stage, "report/demo_1")
     policy = answer.headers["content-security-policy"]
     assert answer.status_code == 200 and "script-src" not in policy and "default-src 'none'" in policy
+
+
+OPENED, UNLISTED = "P01/2026-03-14/demo; touch x_20260314_120000", "P01/2026-03-14/notes"
+BOTH, HERE = ["PlotJuggler", "Foxglove"], "127.0.0.1"
+ENVIRONMENT = {
+    "PATH": "{0}/bin:/usr/bin:/bin",
+    "AMENT_PREFIX_PATH": "{0}/none:{0}/ros",
+    "DISPLAY": ":0",
+    "WAYLAND_DISPLAY": "",
+}
+PROXIED = {"host": "panel.example.org", "origin": "http://panel.example.org"}
+# By case: the client's address, what differs of its headers and of the panel's environment, an arm's state, and what
+# differs of the request; the programs that are offered, and the status.
+OPENINGS: dict[str, tuple[str, dict[str, str], dict[str, str], str | None, dict[str, Any], list[str], int]] = {
+    "PlotJuggler": (HERE, {}, {}, "disabled", {}, BOTH, 200),
+    "Foxglove": (HERE, {}, {}, "fault", {"program": "Foxglove"}, BOTH, 200),
+    "from another computer": ("192.168.1.4", {}, {}, "disabled", {}, [], 403),
+    "through a proxy on this one": (HERE, PROXIED, {}, "disabled", {}, [], 403),
+    "by the page of another site": (HERE, {"origin": "https://evil.example.org"}, {}, "disabled", {}, BOTH, 403),
+    "by a page that only watches": (HERE, {"x-panel-page": ""}, {}, "disabled", {}, BOTH, 403),
+    "none is installed": (HERE, {}, {"PATH": "/usr/bin:/bin", "AMENT_PREFIX_PATH": ""}, "disabled", {}, [], 409),
+    "no screen": (HERE, {}, {"DISPLAY": ""}, "disabled", {}, [], 409),
+    "an arm is carried": (HERE, {}, {}, "active", {}, BOTH, 409),
+    "an arm is silent": (HERE, {}, {}, None, {}, BOTH, 409),
+    "a folder that is not listed": (HERE, {}, {}, "disabled", {"name": UNLISTED}, BOTH, 409),
+    "no folder": (HERE, {}, {}, "disabled", {"name": ""}, BOTH, 409),
+    "a path": (HERE, {}, {}, "disabled", {"name": f"{OPENED}/../../../{OPENED}"}, BOTH, 409),
+    "no name": (HERE, {}, {}, "disabled", {"name": ["P01"]}, BOTH, 400),
+    "another program": (HERE, {}, {}, "disabled", {"program": "sh"}, BOTH, 409),
+}
+
+
+@pytest.mark.parametrize(
+    ("address", "headers", "environment", "state", "changes", "offered", "status"), OPENINGS.values(), ids=OPENINGS
+)
+def test_a_listed_recording_is_opened_in_a_program_on_this_computer_by_its_operator_while_the_arms_are_off(
+    locked, tmp_path, monkeypatch, address, headers, environment, state, changes, offered, status
+):
+    for place in ("ros/lib/plotjuggler/plotjuggler", "bin/foxglove-studio"):
+        (viewer := tmp_path / place).parent.mkdir(parents=True)
+        viewer.write_text(
+            f'#!/bin/sh\nprintf "%s\\n" "${{0##*/}}" "$@" > {tmp_path}/told_\nmv {tmp_path}/told_ {tmp_path}/told\n'
+        )
+        viewer.chmod(0o755)
+    for variable, value in {**ENVIRONMENT, **environment}.items():
+        monkeypatch.setenv(variable, value.format(tmp_path))
+    for name in (OPENED, UNLISTED):
+        (bag := tmp_path / "out" / name / "bag").mkdir(parents=True)
+        (bag / "bag_0.mcap").touch()
+    device = Mock(**{"states.return_value": {"right": state, "left": "disabled"}})
+    locked.control.files = Recordings(str(tmp_path / "out"), tmp_path, device, print, lambda: 0.0)
+    own = {"origin": origin_of(locked), "x-panel-page": locked.control.open("", address).secret}
+
+    async def asked() -> tuple[httpx.Response, httpx.Response]:
+        transport = httpx.ASGITransport(locked.server.access, client=(address, 50000))
+        async with httpx.AsyncClient(transport=transport, base_url=locked.url, headers=own) as browser:
+            await browser.post("/login", data={"token": TOKEN})
+            answer = await browser.post(
+                "/action", headers=headers, json={"do": "open", "name": OPENED, "program": "PlotJuggler", **changes}
+            )
+            return await browser.get("/sessions", headers=headers), answer
+
+    sessions, answer = asyncio.run(asked())
+    assert (sessions.json()["programs"], answer.status_code) == (offered, status), answer.text
+    if status == 200:
+        wait_until((tmp_path / "told").exists)
+        assert (tmp_path / "told").read_text().splitlines() == [
+            *(["foxglove-studio"] if changes else ["plotjuggler", "-d"]),
+            f"{tmp_path}/out/{OPENED}/bag/bag_0.mcap",
+        ]
+    assert (tmp_path / "told").exists() == (status == 200)
 
 
 BODIES = [

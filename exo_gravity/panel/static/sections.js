@@ -216,6 +216,7 @@ class Session {
     for (const control of this.form.elements) control.disabled = !operates || !isOff;
     byId("keep-wearer").disabled = !operates || !session.subject;
     byId("past-filter").disabled = !isOff;
+    for (const button of byId("past").querySelectorAll("button")) button.disabled = !operates || !isOff;
     const present = JSON.stringify(session);
     if (present !== this.present) this.showPresent(session, this.present === "");
     this.present = present;
@@ -238,7 +239,7 @@ class Session {
   }
 
   async list() {
-    const { subjects, past } = await (await fetch("/sessions")).json();
+    const { subjects, past, programs } = await (await fetch("/sessions")).json();
     byId("subjects").replaceChildren(...subjects.map((code) => new Option(code, code)));
     byId("past").replaceChildren(
       ...past.map((entry) => {
@@ -250,6 +251,11 @@ class Session {
         const add = (kind, name, text) => links.append(Object.assign(document.createElement("a"), { href: fileAt(kind, name), target: "_blank", rel: "noopener", textContent: text }), " ");
         if (entry.report) add("report", entry.report, t("past_report"));
         if (entry.folder) add("recording", entry.folder, "MCAP");
+        for (const program of entry.folder ? programs : []) {
+          const button = Object.assign(document.createElement("button"), { textContent: t("past_program", program), disabled: true });
+          button.addEventListener("click", () => this.send({ do: "open", name: entry.folder, program }));
+          links.append(button, " ");
+        }
         return row;
       }),
     );
