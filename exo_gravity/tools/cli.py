@@ -10,32 +10,26 @@ import math
 import os
 import sys
 from collections.abc import Callable
+from functools import partial
 from io import TextIOWrapper
 
 from exo_gravity.core.errors import ExoGravityError
 from exo_gravity.lab.packages import extras
 
 
-def non_negative(text: str) -> float:
-    """Return the number that `text` spells, 0 or more; raise ArgumentTypeError otherwise, also for NaN."""
+def _number(text: str, kind: type[float], least: int, expected: str) -> float:
     try:
-        number = float(text)
+        number = kind(text)
     except ValueError:
         number = math.nan
-    if not number >= 0.0:
-        raise argparse.ArgumentTypeError(f"{text}: must be a number, 0 or more")
+    if not number >= least:  # also for NaN
+        raise argparse.ArgumentTypeError(f"{text}: must be {expected}")
     return number
 
 
-def positive(text: str) -> int:
-    """Return the whole number that `text` spells, 1 or more; raise ArgumentTypeError otherwise."""
-    try:
-        number = int(text)
-    except ValueError:
-        number = 0
-    if number < 1:
-        raise argparse.ArgumentTypeError(f"{text}: must be a whole number, 1 or more")
-    return number
+# Types of arguments
+non_negative = partial(_number, kind=float, least=0, expected="a number, 0 or more")
+positive = partial(_number, kind=int, least=1, expected="a whole number, 1 or more")
 
 
 def exit_code(tool: str, extra: str, work: Callable[[], int]) -> int:
