@@ -33,8 +33,10 @@ def _arguments(args: Sequence[str] | None) -> argparse.Namespace:
     )  # fmt: skip
     option("--support", type=float, default=1.0, metavar="0..1", help="share of the wearer's arm carried (%(default)s)")
     option("--payload", type=float, default=0.0, metavar="KG", help="load in the hand (%(default)s)")
-    tilt = "largest trunk pitch and roll, in either direction (%(default)s)"
-    option("--max-tilt", type=float, default=USUAL_TILT, metavar="DEG", help=tilt)
+    option(
+        "--max-tilt", type=float, default=USUAL_TILT, metavar="DEG",
+        help="largest trunk pitch and roll, in either direction (%(default)s)",
+    )  # fmt: skip
     option("--output", default="budget", metavar="DIR", help="folder for a figure of each joint (%(default)s)")
     return parser.parse_args(args)
 

@@ -23,7 +23,6 @@ from exo_gravity.lab.inputs.arms import configured_arm
 from exo_gravity.tools.cli import extras
 
 if TYPE_CHECKING:
-    from exo_gravity.lab.calibration.live import Person
     from exo_gravity.lab.calibration.result import CalibrationResult
 
 ACCEPTANCE, NEW = "acceptance", "new"
@@ -38,7 +37,6 @@ COMMANDS = {
     "imu": ("imu", "the mounting of the IMU, from standing upright and bowing"),
     ACCEPTANCE: ("", "nothing: a record (JSON) of what the first real, unworn arm shows on the bench, step by step"),
 }
-MAX_POSES = 12
 
 
 def _arguments(args: Sequence[str] | None) -> argparse.Namespace:
@@ -65,20 +63,27 @@ def _arguments(args: Sequence[str] | None) -> argparse.Namespace:
         if name == "imu":
             option("--rests", type=Path, metavar="FOLDER", help="recording of the IMU resting on each of its six sides")
         if name == "gravity":
-            option("--poses", type=int, default=MAX_POSES, metavar="N", help="largest number of poses (%(default)s)")
+            option("--poses", type=int, default=12, metavar="N", help="largest number of poses (%(default)s)")
         if name == "wearer":
-            carried = "share of their arm that the wearer may have held throughout (0.2); 0 where EMG was silent"
-            option("--carried", type=float, metavar="SHARE", help=carried)
+            option(
+                "--carried", type=float, metavar="SHARE",
+                help="share of their arm that the wearer may have held throughout (0.2); 0 where EMG was silent",
+            )  # fmt: skip
         if name in ("gravity", "scale"):
             option(
                 "--earlier", type=Path, metavar="TOUR.jsonl",
                 help="record of an earlier tour of this arm by the same file, its motors colder or warmer: "
                 "shows how torque_scale depends on the temperature",
             )  # fmt: skip
-            zeros = "assumed standard error of the encoders' zeros (0.86); 0 keeps those of a jig"
-            option("--zeros", type=float, metavar="DEG", help=zeros)
-            axes = "assumed standard error of each joint's axis in each direction across it, by CAD or brackets (0.6)"
-            option("--axes", type=float, metavar="DEG", help=axes)
+            option(
+                "--zeros", type=float, metavar="DEG",
+                help="assumed standard error of the encoders' zeros (0.86); 0 keeps those of a jig",
+            )  # fmt: skip
+            option(
+                "--axes", type=float, metavar="DEG",
+                help="assumed standard error of each joint's axis in each direction across it, by CAD or "
+                "brackets (0.6)",
+            )  # fmt: skip
         if name == "scale":
             option("--mass", type=float, required=True, metavar="KG", help="of the weight")
             option("--lever", type=float, required=True, metavar="M", help="from the last joint to the weight")
@@ -123,9 +128,17 @@ def _run(options: argparse.Namespace) -> int:
     command: str = options.command
     check_output(options.output)
     if command == NEW:
-        return _write_new(options)
+        from exo_gravity.lab.calibration.new import MEASURE, NewArm, write_new
+
+        names = ("urdf", "motors", "ids", "joints", "hand", "side", "channel", "fd", "simulate")
+        notes = write_new(NewArm(*(getattr(options, name) for name in names)), options.output)
+        print(*notes, f"Written: {options.output}; {MEASURE} in it marks what is still to be measured", sep="\n")
+        return 0
     if command == ACCEPTANCE:
-        return _accept(options, Person())
+        from exo_gravity.lab.acceptance import Weight, accept_arm
+
+        bench = configured_arm(options.params, options.side), Weight(options.mass, options.lever), Person()
+        return 0 if accept_arm(options.params, options.output, *bench) else 1
     options.record, page = options.output.with_suffix(".jsonl"), options.output.with_suffix(".html")
     for path in (options.record, page):
         check_output(path)
@@ -151,23 +164,3 @@ def _run(options: argparse.Namespace) -> int:
     for refusal in result.refusals:
         print(f"calibrate: not calibrated: {refusal}", file=sys.stderr)
     return 1 if result.refusals else 0
-
-
-def _write_new(options: argparse.Namespace) -> int:
-    """Write the first file of an arm; return the exit code."""
-    from exo_gravity.lab.calibration.new import MEASURE, NewArm, write_new
-
-    names = ("urdf", "motors", "ids", "joints", "hand", "side", "channel", "fd", "simulate")
-    said = (getattr(options, name) for name in names)
-    for note in write_new(NewArm(*said), options.output):
-        print(note)
-    print(f"Written: {options.output}; {MEASURE} in it marks what is still to be measured")
-    return 0
-
-
-def _accept(options: argparse.Namespace, person: "Person") -> int:
-    """Run the bench acceptance; return the exit code."""
-    from exo_gravity.lab.acceptance import Weight, accept_arm
-
-    arm, weight = configured_arm(options.params, options.side), Weight(options.mass, options.lever)
-    return 0 if accept_arm(options.params, options.output, arm, weight, person) else 1

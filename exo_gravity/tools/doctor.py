@@ -40,8 +40,10 @@ def show(findings: Sequence[Finding], console: "Console") -> None:
 def _arguments(args: Sequence[str] | None) -> argparse.Namespace:
     parser = argparse.ArgumentParser(prog="doctor", description="Whether this computer is fit to carry an arm.")
     parser.add_argument("--params", metavar="FILE", help="ROS 2 parameter file (default: the packaged sim.yaml)")
-    seconds = "for which wake-ups are measured (%(default)s)"
-    parser.add_argument("--seconds", type=non_negative, default=10.0, metavar="S", help=seconds)
+    parser.add_argument(
+        "--seconds", type=non_negative, default=10.0, metavar="S",
+        help="for which wake-ups are measured (%(default)s)",
+    )  # fmt: skip
     return parser.parse_args(args)
 
 

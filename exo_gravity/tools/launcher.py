@@ -55,14 +55,20 @@ def _arguments(args: Sequence[str] | None) -> argparse.Namespace:
         f"executable can_bridge in the namespace /right, /imu starts imu. Executables: {', '.join(node_modules())}.",
     )
     parser.add_argument("--params", metavar="FILE", help="ROS 2 parameter file (default: the packaged sim.yaml)")
-    only = "start only the nodes whose full names match a shell pattern: '*/can_bridge' /imu"
-    parser.add_argument("--only", metavar="PATTERN", nargs="+", action="extend", default=[], help=only)
-    share = "run can_bridge and compensator of an arm in one process, see docs/performance.md"
-    parser.add_argument("--one-process", action="store_true", help=share)
+    parser.add_argument(
+        "--only", metavar="PATTERN", nargs="+", action="extend", default=[],
+        help="start only the nodes whose full names match a shell pattern: '*/can_bridge' /imu",
+    )  # fmt: skip
+    parser.add_argument(
+        "--one-process", action="store_true",
+        help="run can_bridge and compensator of an arm in one process, see docs/performance.md",
+    )  # fmt: skip
     parser.add_argument("--panel", action="store_true", help="also start the operator's panel, where the file has none")
     parser.add_argument("--namespace", metavar="NAME", default="", help="in front of every node and of /imu/...")
-    remap = "let every node use another topic, as the -r of ROS does"
-    parser.add_argument("--remap", metavar="FROM:=TO", action="append", default=[], help=remap)
+    parser.add_argument(
+        "--remap", metavar="FROM:=TO", action="append", default=[],
+        help="let every node use another topic, as the -r of ROS does",
+    )  # fmt: skip
     parser.add_argument("--log-level", default="info", choices=LOG_LEVELS, help="of every node (default: info)")
     return parser.parse_args(args)
 
@@ -81,22 +87,20 @@ def main(args: Sequence[str] | None = None) -> None:
     if os.environ.get("EXO_GRAVITY_SUPERVISED"):  # by `ros2 launch`, which holds our standard input open
         threading.Thread(target=_stop_with_parent, args=(stopping,), daemon=True).start()
     space, restarts = options.namespace.strip("/"), deque([-math.inf] * 3, maxlen=3)  # the latter in monotonic s
-    make = partial(
-        Launcher,
-        options.params or packaged_config("sim.yaml"),
-        print_line,
-        options.only,
-        ["/panel"] if options.panel else [],
-        f"/{space}" if space else "",
-        options.log_level,
-        options.one_process,
-        options.remap,
-        check_start,
-    )
     keep_to_this_machine()
     try:
         while True:
-            launcher = make()
+            launcher = Launcher(
+                options.params or packaged_config("sim.yaml"),
+                print_line,
+                options.only,
+                ["/panel"] if options.panel else [],
+                f"/{space}" if space else "",
+                options.log_level,
+                options.one_process,
+                options.remap,
+                check_start,
+            )
             if sentence := kept_to_this_machine():
                 print_line("launcher", sentence)
             with asking_on_terminal(launcher.asking, partial(print_line, "launcher")):

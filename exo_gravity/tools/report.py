@@ -29,22 +29,32 @@ from exo_gravity.tools.cli import exit_code, extras, non_negative, positive
 def _arguments(args: Sequence[str] | None) -> argparse.Namespace:
     parser = argparse.ArgumentParser(prog="report", description="Report a recorded trial: holds, drift, pushes.")
     option = parser.add_argument
-    bag = "rosbag2 folder, or an .mcap or .db3 file, complete or cut short; or several; or a folder of recordings"
-    option("bag", nargs="+", help=bag)
+    option(
+        "bag", nargs="+",
+        help="rosbag2 folder, or an .mcap or .db3 file, complete or cut short; or several; or a folder of recordings",
+    )  # fmt: skip
     option("--output", metavar="DIR", help="folder for the report (default: BAG_report next to the first recording)")
     option("--csv", action="store_true", help="also write the time series, time_series.csv, a row per sample and joint")
     option("--parquet", action="store_true", help="the same table as time_series.parquet")
-    lerobot = "also write a LeRobot dataset (v3.0), an episode per recording, of this many frames per s"
-    option("--lerobot", type=positive, metavar="RATE", help=lerobot)
-    by = "what makes a condition of a study: protocol, mode, support (all)"
-    option("--by", nargs="+", choices=("protocol", "mode", "support"), metavar="KEY", help=by)
-    every = "keep one of N samples of each arm: less memory, a coarser report (%(default)s)"
-    option("--decimate", type=positive, default=1, metavar="N", help=every)
+    option(
+        "--lerobot", type=positive, metavar="RATE",
+        help="also write a LeRobot dataset (v3.0), an episode per recording, of this many frames per s",
+    )  # fmt: skip
+    option(
+        "--by", nargs="+", choices=("protocol", "mode", "support"), metavar="KEY",
+        help="what makes a condition of a study: protocol, mode, support (all)",
+    )  # fmt: skip
+    option(
+        "--decimate", type=positive, default=1, metavar="N",
+        help="keep one of N samples of each arm: less memory, a coarser report (%(default)s)",
+    )  # fmt: skip
     option(
         "--scheduler", metavar="ADDRESS", help="of a Dask cluster whose workers read the recordings, tcp://HOST:8786"
     )
-    formats = "also write each figure in this format; twice for both"
-    option("--figures", action="append", choices=("pdf", "svg"), default=[], help=formats)
+    option(
+        "--figures", action="append", choices=("pdf", "svg"), default=[],
+        help="also write each figure in this format; twice for both",
+    )  # fmt: skip
     option("--width", type=non_negative, metavar="MM", help="of these, as printed: 85 is one column (170)")
     option("--font", metavar="NAME", help="of these, in 8 pt (DejaVu Sans)")
     option("--joints", type=positive, nargs="+", default=[], metavar="N", help="joints of the overview (all)")
@@ -85,8 +95,8 @@ def _run(options: argparse.Namespace) -> int:
         max_stray_after_push=math.radians(options.max_drift_after_push),
         max_rate=math.radians(options.max_rate) / 60.0,
     )
-    look = {"width": options.width, "font": options.font}
-    on_paper = html.Print(options.figures, **{name: value for name, value in look.items() if value})
+    given = {name: value for name in ("width", "font") if (value := getattr(options, name))}
+    on_paper = html.Print(options.figures, **given)
     (path, *more), screen = options.bag, Console(stderr=True)
     beside = path.resolve().with_name(f"{path.resolve().stem}_report")
     if more or options.scheduler or (path.is_dir() and cohort.recordings_below(path) not in ([], [path])):

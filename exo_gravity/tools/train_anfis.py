@@ -26,8 +26,10 @@ def _arguments(args: Sequence[str] | None) -> argparse.Namespace:
     option("--params", metavar="FILE", help="ROS 2 parameter file (default: the packaged exo.yaml)")
     option("--side", choices=SIDES, default="right", help="which of its arms (default: right)")
     option("--bag", metavar="BAG", help="learn from the holds of this rosbag2 recording instead of from gravload")
-    functions = "membership functions per input (default: 4, for a bag 2)"
-    option("--functions", metavar="N", type=int, choices=range(2, 7), help=functions)
+    option(
+        "--functions", metavar="N", type=int, choices=range(2, 7),
+        help="membership functions per input (default: 4, for a bag 2)",
+    )  # fmt: skip
     option("--output", required=True, metavar="FILE", help="where to save the law, e.g. anfis.json")
     return parser.parse_args(args)
 

@@ -27,15 +27,6 @@ pytestmark = [*IN_BROWSER, pytest.mark.real_time]
 RECORDING = 50_000  # bytes of a file into which joint states are written
 
 
-def panel_diagnostics(bag: Path) -> list[str]:
-    arrays = [
-        STORE.deserialize_cdr(data, "diagnostic_msgs/msg/DiagnosticArray")
-        for rows in Storage(bag).rows(lambda topic, _: topic == "/diagnostics")
-        for data in rows.batch.messages()
-    ]
-    return [status.message for array in arrays for status in array.status if status.name == "panel"]
-
-
 @pytest.fixture
 def clinic(tmp_path: Path) -> Iterator[tuple[LaunchedNodes, RosProbe, Page]]:
     """The nodes of the right arm, which is carried, with trials; a probe, and the open page."""
@@ -80,7 +71,12 @@ def test_a_session_is_recorded_and_reported_an_arm_put_back_and_the_panels_death
     page.click("#record-stop")
     page.wait_for_selector("#record:enabled")
     (recording,) = out.glob("recording_*")
-    noted = panel_diagnostics(recording / "bag")
+    arrays = [
+        STORE.deserialize_cdr(data, "diagnostic_msgs/msg/DiagnosticArray")
+        for rows in Storage(recording / "bag").rows(lambda topic, _: topic == "/diagnostics")
+        for data in rows.batch.messages()
+    ]
+    noted = [status.message for array in arrays for status in array.status if status.name == "panel"]
     assert any("page 1: let down: done" in text for text in noted), noted
     page.click("#save")
     page.wait_for_selector("#saved:has-text('params.yaml')")

@@ -42,8 +42,9 @@ class PanelProcess:
         given = {"port": self.port, "output": str(folder), **parameters}
         options = [word for name, value in given.items() for word in ("-p", f"{name}:={value}")]
         self.url = f"http://127.0.0.1:{self.port}/"
-        command = [executable("panel"), "--ros-args", *options]
-        self.process = subprocess.Popen(command, stdout=sys.stderr, stderr=subprocess.PIPE, text=True)
+        self.process = subprocess.Popen(
+            [executable("panel"), "--ros-args", *options], stdout=sys.stderr, stderr=subprocess.PIPE, text=True
+        )
         self.address = next(line for line in self.process.stderr or () if "http://" in line)
         self.closing = ExitStack()
 
@@ -110,10 +111,13 @@ class PlayedArm:
 
     def _publish(self) -> None:
         self._states.publish(JointState(name=NAMES, position=[0.1] * 4, velocity=[0.0] * 4, effort=[1.0] * 4))
-        values = [KeyValue(key="state", value="disabled"), KeyValue(key="fault", value="none")]
-        values.append(KeyValue(key="control held by", value=self.holder))
+        told = {"state": "disabled", "fault": "none", "control held by": self.holder}
         # The panel decides by keys alone: this is no sentence of ours.
-        status = DiagnosticStatus(name="right/can_bridge", message="zqx vw: kfj", values=values)
+        status = DiagnosticStatus(
+            name="right/can_bridge",
+            message="zqx vw: kfj",
+            values=[KeyValue(key=key, value=value) for key, value in told.items()],
+        )
         self._statuses.publish(DiagnosticArray(status=[status]))
 
     def _on_control(self, message: KeyValue) -> None:
@@ -163,13 +167,15 @@ def test_the_page_shows_and_operates_an_arm_that_comes_and_goes_and_no_node_of_a
         status, refusal = page.ask("activate", arm="right")
         assert status == 409 and "could not be activated" in refusal
         assert page.ask("set", arm="right", values={"support": 0.2}) == (200, "")
-        settings = page.get("settings/right").json()  # also before the panel has heard of it
-        assert settings == {"settings": {"support": 0.2}}
+        # Also before the panel has heard of it
+        assert page.get("settings/right").json() == {"settings": {"support": 0.2}}
         page.message("setup", lambda setup: is_known(setup, 0.2))
         assert page.ask("let_down") == (200, "")
-        steps = (Transition.TRANSITION_CONFIGURE, Transition.TRANSITION_ACTIVATE) * 3
-        activated = [("change_state", step) for step in steps]
-        assert arm.asked == [("enable", True), ("clear_fault", None), *activated, ("enable", False)]
+        activated = [
+            ("change_state", Transition.TRANSITION_CONFIGURE),
+            ("change_state", Transition.TRANSITION_ACTIVATE),
+        ]
+        assert arm.asked == [("enable", True), ("clear_fault", None), *activated * 3, ("enable", False)]
     finally:
         arm.close()
         other.close()

@@ -131,8 +131,7 @@ class PlayedArms:
         }
         values |= {"waiting for": "none", "joints outside limits": "none", "turn back (deg)": "none"}
         sentence = f"fault: {fault}: {name} elbow" if fault != "none" else state
-        level = 2 if fault != "none" else 0
-        bridge = {**values, "level": level, "message": sentence, **self.reports.get(name, {})}
+        bridge = {**values, "level": 2 if fault != "none" else 0, "message": sentence, **self.reports.get(name, {})}
         carried = {"mass carried (kg)": "1.854", "level": 0, "message": "compensating", "state": "compensating"}
         carried |= {"changing load": "none", "reason": "none", "weighing": "none", **self.compensator}
         share = dict.fromkeys(("share of the wearer (%)", "share band (%)"), "unknown")

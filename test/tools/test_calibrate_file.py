@@ -78,8 +78,7 @@ def test_a_simulated_arm_of_a_new_file_is_carried_wherever_it_is_started(motor, 
     monkeypatch.chdir("/")
     script = TrialScript.parse({"name": "raise", "steps": [{"move": [0.8], "over": 3.0}, {"hold": 3.0}]})
     (trial,) = simulated_trials(tmp_path / "arm.yaml", script)
-    recording = trial.run()
-    assert not trial.trouble and recording.position.max() > 0.7
+    assert trial.run().position.max() > 0.7 and not trial.trouble
 
 
 TABLE = """<robot name="table"><link name="base"/>
@@ -301,8 +300,7 @@ LOADED = np.arange(len(POSES)) % 2 == 1  # every second pose has the weight on l
 
 def predicted(arm: ArmModel) -> np.ndarray:
     """Return the torque (n, 4) in Nm that holds `arm` in each pose."""
-    weight = PAPERS.rows(POSES, DOWN) @ PAPERS.load(*LOAD)
-    return gravity_torque(arm, POSES, DOWN) + LOADED[:, None] * weight
+    return gravity_torque(arm, POSES, DOWN) + LOADED[:, None] * (PAPERS.rows(POSES, DOWN) @ PAPERS.load(*LOAD))
 
 
 def outcome(touched: float = 0.0) -> CalibrationResult:

@@ -46,9 +46,8 @@ def record(
     time = np.arange(0.0, bowed + 7.0, 1.0 / RATE)
     s = np.interp(time, np.cumsum((0.0, upright, 1.5, 2.0, 1.5, 2.0)), (0.0, 0.0, 1.0, 1.0, 0.0, 0.0))
     share = s * s * (3.0 - 2.0 * s)
-    delayed = np.interp(time - late, time, share)
     leant = np.interp(time - bowed, np.cumsum((0.0, 1.5, 2.0, 1.5)), (0.0, 1.0, 1.0, 0.0))
-    pitch = posture[0] + bow * delayed
+    pitch = posture[0] + bow * np.interp(time - late, time, share)
     roll = posture[1] + lean * share + right * leant * leant * (3.0 - 2.0 * leant)
     imu = SimulatedImu(ImuConfig(tuple(quaternion), RATE, seed=seed))
     rates = np.gradient(pitch, time), np.gradient(roll, time)
@@ -182,8 +181,7 @@ def calibrate(run_tool, tmp_path):
 
 
 def is_found(tmp_path: Path) -> bool:
-    found = load(tmp_path / "new.yaml")["/imu"]["rotation_trunk_from_imu"]
-    return angle_of(found, MOUNTED) < math.radians(1.5)
+    return angle_of(load(tmp_path / "new.yaml")["/imu"]["rotation_trunk_from_imu"], MOUNTED) < math.radians(1.5)
 
 
 def test_the_mounting_goes_into_the_new_file_and_onto_the_page_and_six_rests_beside_it(tmp_path, calibrate) -> None:

@@ -81,8 +81,7 @@ def test_the_calibrator_replaces_the_compensator_and_the_tour_takes_its_paramete
     assert set(nodes) == {"/imu", "/right/can_bridge", "/right/simulator", "/right/calibrator"}
     given = nodes["/right/calibrator"]
     assert given["max_effort"] == list(ARM.limits.max_effort) and given["tour.poses"] == 3
-    tour = tour_of(values_of(CALIBRATOR, given))
-    assert np.all(np.isfinite(tour.wait((0.1, 0.2, 0.3, 0.4), Tilt.of("right"))))
+    assert np.all(np.isfinite(tour_of(values_of(CALIBRATOR, given)).wait((0.1, 0.2, 0.3, 0.4), Tilt.of("right"))))
 
 
 # Cables across the joints
@@ -222,9 +221,8 @@ def test_recordings_without_and_with_the_weight_give_kilograms_and_true_scales(t
         run = TourRun(truth=loaded, motors=motors, load=(mass, lever))
         run.run(Itinerary(run.limits, 8, 160.0))
         bag = recorded_by(run, tmp_path / command, configured_arm(files[number]).can_bridge["torque_scale"])
-        weight = ["--mass", mass, "--lever", lever] if mass else []
         words = ["calibrate", command, "--params", files[number], "--output", files[number + 1], "--bag", bag]
-        assert run_tool(*words, *weight).code == 0
+        assert run_tool(*words, *["--mass", mass, "--lever", lever] * bool(mass)).code == 0
     found = configured_arm(files[2])
     np.testing.assert_allclose(found.can_bridge["torque_scale"][1:], SCALES[1:], rtol=0.04)
     np.testing.assert_allclose(found.robot.first_moment[1:], TRUTH.first_moment[1:], rtol=0.04)
@@ -347,8 +345,7 @@ def left_by_calibration(name: str, folder: Path, run_tool) -> tuple[float, float
     simulator |= {key: one.tolist() for key, one in zip(names, (mass, cog, STIFFNESS * last, REST * last), strict=True)}
     simulator["can.options.port"] = nodes["/right/can_bridge"]["can.options.port"] = port
     files[0].write_text(text_of(nodes))
-    words = ("calibrate", "wearer", "--params", files[0], "--output", files[1], "--carried", 0)
-    assert run_tool(*words).code == 0
+    assert run_tool("calibrate", "wearer", "--params", files[0], "--output", files[1], "--carried", 0).code == 0
     described = (CONFIG / "arms" / f"{name}.urdf").read_text(encoding="utf-8"), simulator["joint_names"]
     truth = WornMujocoArm(*described, mass, cog, stiffness=STIFFNESS * last, rest=REST * last)
     without = WornMujocoArm(*described, 0.0 * mass, cog)

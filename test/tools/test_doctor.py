@@ -107,10 +107,10 @@ def test_what_delays_threads_is_a_warning_only_where_they_were_late(computer, wh
     assert {row.level for row in of_computer(computer).values()} == {Level.FINE}  # it could not be better
     for path, content in change.items():
         (computer / path).write_text(content)
-    levels = [of_computer(computer, is_late)[what].level for is_late in (False, True)]
-    assert levels == [Level.NOTE, Level.WARNING]
-    silent = of_computer(computer / "none", is_late=True)  # a container states nothing of its CPUs: no fault
-    assert max(row.level for row in silent.values()) is Level.UNKNOWN
+    for is_late, level in ((False, Level.NOTE), (True, Level.WARNING)):
+        assert of_computer(computer, is_late)[what].level is level
+    # A container states nothing of its CPUs: no fault
+    assert max(row.level for row in of_computer(computer / "none", is_late=True).values()) is Level.UNKNOWN
 
 
 def test_the_command_for_idle_states_names_those_that_are_too_deep_for_the_rate(computer):

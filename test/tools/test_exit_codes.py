@@ -236,9 +236,10 @@ def test_a_missing_package_is_named_in_one_line_with_what_installs_it_and_help_s
     module, package, installs = WITHOUT[words]
     helps = words.partition(" ")[0] not in node_modules()
     for given, code in [(words.split(), 2)] + helps * [([*words.split(), "--help"], 0)]:
-        program = PROGRAM.format(module=module, package=package, words=given)
-        command = [sys.executable, "-c", program]
-        ended = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, timeout=100, check=False)
+        ended = subprocess.run(
+            [sys.executable, "-c", PROGRAM.format(module=module, package=package, words=given)],
+            cwd=tmp_path, capture_output=True, text=True, timeout=100, check=False,
+        )  # fmt: skip
         assert ended.returncode == code, ended.stderr
         assert (installs in ended.stderr and ended.stderr.count("\n") == 1) if code else "usage: " in ended.stdout
 

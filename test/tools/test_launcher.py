@@ -37,12 +37,11 @@ def test_a_closed_terminal_stops_the_launcher_as_ctrl_c_does():
 
 def test_the_node_names_are_the_modules_with_an_entry_point_and_help_lists_them(run_tool):
     folder = ROOT / "exo_gravity" / "nodes"
-    with_main = [
-        path
+    modules = {
+        path.parent.name if path.stem == "node" else path.stem
         for path in (*folder.glob("*.py"), *folder.glob("*/node.py"))
         if "\ndef main(" in path.read_text(encoding="utf-8")
-    ]
-    modules = {path.parent.name if path.stem == "node" else path.stem for path in with_main}
+    }
     # The launcher runs pose_prompt on its own terminal: it is no node.
     assert {*node_modules(), "pose_prompt"} == modules >= {"can_bridge", "imu", "compensator", "simulator", "recorder"}
     code, out, _ = run_tool("launcher", "--help")

@@ -146,9 +146,9 @@ def test_the_report_is_written_next_to_its_recording_and_on_request_time_series_
     short_bag, tmp_path, monkeypatch, run_tool
 ):
     assert run_tool("report", short_bag).code == 0
-    written = {path.name for path in short_bag.with_name("short_report").iterdir()}
-    tables = {"holds.csv", "motions.csv", "report.html", "report.json"}
-    assert written == {*tables, "right_drift.png", "right_overview.png"}
+    assert {path.name for path in short_bag.with_name("short_report").iterdir()} == {
+        *("holds.csv", "motions.csv", "report.html", "report.json", "right_drift.png", "right_overview.png")
+    }
     nowhere = run_tool("report", short_bag, "--output", short_bag / "metadata.yaml" / "report")
     assert nowhere.code == 2 and "cannot write the report there" in nowhere.err
     assert run_tool("report", short_bag, "--output", tmp_path, "--csv").code == 0
@@ -323,8 +323,7 @@ def test_only_joints_that_moved_are_drawn_and_the_others_are_a_line(page_of):
     report = analyse(made.bag_of(made.trial(made.POSES, hold=6.0, rate=100.0, drift=AWAY)))
     titles = [axis.get_title(loc="left") for axis in figures.drift(*report.arms[0], report.criteria).axes]
     assert [title for title in titles if title] == ["joint 4"]
-    text = page_of(report).text
-    assert re.search(r"none of joint 1, joint 2, joint 3 moved more than 0\.0\d\d degrees", text)
+    assert re.search(r"none of joint 1, joint 2, joint 3 moved more than 0\.0\d\d degrees", page_of(report).text)
 
 
 LET_DOWN = replace(made.trial(made.POSES, hold=6.0, fall_after=12.5), carried=((0.0, 12.5),))  # and it fell
@@ -367,8 +366,7 @@ VERDICTS = {  # the recording, what happened, why the trial ended early, the sen
 
 @pytest.mark.parametrize(("recording", "events", "trouble", "sentence", "is_good"), VERDICTS.values(), ids=VERDICTS)
 def test_the_report_leads_with_what_happened(recording, events, trouble, sentence, is_good):
-    bag = report_of(recording, *events).bag
-    text, good = analyse(bag, trouble=trouble).verdict
+    text, good = analyse(report_of(recording, *events).bag, trouble=trouble).verdict
     assert re.match(sentence, text), text
     assert good is is_good
 
@@ -428,8 +426,7 @@ def shared_by_seven(share: float) -> tuple[Recording, dict[str, Any]]:
     names, text = given["joint_names"], (CONFIG / "arms" / "seven_joints.urdf").read_text(encoding="utf-8")
     mass, cog = [0.0, 0.0, 1.5, 0.0, 1.0, 0.0, 0.0], [0.0, 0.0, 0.12, 0.0, 0.1, 0.0, 0.0]
     pose = [0.6, 0.5, 0.3, 0.9, 0.2, 0.3, -0.2]
-    effort = WornMujocoArm(text, names, [(1.0 - share) * m for m in mass], cog).torque(pose)
-    return still(names, pose, effort), {
+    return still(names, pose, WornMujocoArm(text, names, [(1.0 - share) * m for m in mass], cog).torque(pose)), {
         **given, "wearer.mass": mass, "wearer.cog": cog, "mode": "zero_g", "support": 1.0,
     }  # fmt: skip
 
@@ -510,9 +507,8 @@ def test_a_folder_becomes_one_table_and_page_and_what_fails_is_named(trials, tmp
     assert len(rows) == 4 * len(made.NAMES) + 1
     elbow = [float(row["drift_deg_per_min"]) for row in rows if row["joint"] == made.NAMES[3] and row["subject"]]
     np.testing.assert_allclose(elbow, DRIFTS, atol=0.6)
-    moved = np.degrees(np.ptp(np.vstack((np.zeros(4), made.POSES)), axis=0))
     first = [float(row["range_of_motion_deg"]) for row in rows if "day_0" in row["recording"]]
-    np.testing.assert_allclose(first, moved, atol=0.5)
+    np.testing.assert_allclose(np.radians(first), np.ptp(np.vstack((np.zeros(4), made.POSES)), axis=0), atol=0.01)
     below = [row for row in rows if row["joint"] == made.NAMES[3]]
     assert all(0.0 < float(row["drift_uncertainty_deg_per_min"]) < 1.0 for row in below)
     assert re.search(r" [123]\.\d\d ± 0\.\d\d ", text)  # not 0.00 everywhere
@@ -551,10 +547,13 @@ def test_a_move_along_a_bell_of_speed_is_smooth():
 
 def trial_row(subject, mode, **values):
     """Return a trial of the paper's right arm, as `study.trials_of` does; what is not given is unknown."""
-    of_whom = {"subject": subject, "protocol": "reaching", "arm": "right", "source": "real", "verdict": "It held."}
     return {
         **dict.fromkeys(cohort.COLUMNS),
-        **of_whom,
+        "subject": subject,
+        "protocol": "reaching",
+        "arm": "right",
+        "source": "real",
+        "verdict": "It held.",
         "mode": mode,
         "recording": f"{subject}/{mode}/{values}",
         **values,

@@ -115,9 +115,10 @@ def test_an_offline_trial_of_a_subject_ends_with_a_report_of_its_recording_in_th
     worn = {"wearer.body_mass": 75.0}  # of whose arm the motors carry nothing in One-G
     ended, above = run("--offline", "--subject", "P01", "--protocol", "pilot", "--note=- stiff", compensator=worn)
     (folder,) = above.glob("*-*-*/short_*")
-    report_files = {"holds.csv", "motions.csv", "report.html", "report.json"}
-    report_files |= {"right_overview.png", "right_wearer.png"}  # it held: no drift to draw
-    assert above.name == "P01" and {path.name for path in folder.iterdir()} == {"params.yaml", "bag", *report_files}
+    assert above.name == "P01" and {path.name for path in folder.iterdir()} == {
+        *("params.yaml", "bag", "holds.csv", "motions.csv", "report.html", "report.json"),
+        *("right_overview.png", "right_wearer.png"),  # it held: no drift to draw
+    }
     assert ended.code == 0 and "It held." in ended.out
     np.testing.assert_allclose(column(folder, "pose_deg"), np.degrees(SHORT["steps"][0]["move"]), atol=2.0)
     with Reader(folder / "bag") as recorded:  # rosbags' own

@@ -95,9 +95,8 @@ DESCRIBED = {  # the text, and the arms in it: side, joints, robot
 @pytest.mark.parametrize(("text", "arms"), DESCRIBED.values(), ids=DESCRIBED)
 def test_the_description_gives_the_exact_laws_torques(text, arms):
     for side, joints, arm in arms:
-        directions = [Tilt.of_gravity(side, vector).direction for vector in DOWN]
         unscaled = ArmModel.from_moments(arm.length, arm.first_moment, arm.off_axis, gravity=arm.gravity)
-        exact = gravity_torque(unscaled, THETA, directions)
+        exact = gravity_torque(unscaled, THETA, [Tilt.of_gravity(side, vector).direction for vector in DOWN])
         assert by_pinocchio(text, joints, arm.gravity) == pytest.approx(exact, abs=1e-9)  # Nm
 
 

@@ -298,9 +298,8 @@ def write(
             if text := figures.stayed_text(recording, analysis):
                 pictures.append(html.bullets("", [text]))
             if shared:
-                names = recording.joint_names
-                shares = wearer_share.sentence(shared, source), wearer_share.joint_sentence(shared, names)
-                pictures.append(html.bullets("Wearer", shares))
+                of_joints = wearer_share.joint_sentence(shared, recording.joint_names)
+                pictures.append(html.bullets("Wearer", [wearer_share.sentence(shared, source), of_joints]))
             sections += table.arm_section(recording, analysis, pictures)
         (folder / "report.html").write_text(_page(report, sections), encoding="utf-8")
         seconds = max(float(recording.time[-1]) for recording in report.bag.recordings)
