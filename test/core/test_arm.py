@@ -17,7 +17,7 @@ from exo_gravity.core import ArmModel, Tilt, gravity_torque, paper_mobile_torque
 from exo_gravity.core.arm.chain import least_inertia
 from exo_gravity.core.arm.interface import Payload
 from exo_gravity.core.arm.paper import mobile_torque, static_torque
-from exo_gravity.core.arm.wearer import SEX, TABLES, Wearer
+from exo_gravity.core.arm.wearer import Wearer
 from exo_gravity.core.compensation.guidance import DropWatch
 from exo_gravity.lab.inputs.references import OFFSET, gravload, pinocchio, pinocchio_model
 from exo_gravity.sim import ArmConfig, SimulatedArm
@@ -93,16 +93,6 @@ def test_a_75_kg_mans_straight_horizontal_arm_needs_the_torques_worked_out_by_ha
     assert arm.total_mass == pytest.approx(mass, abs=0.01)
     lighter = worn(Wearer(75.0, "female", table, LENGTHS)).total_mass < arm.total_mass
     assert lighter is (table == "de_leva")  # Winter has one table for both
-
-
-@pytest.mark.parametrize("table", TABLES)
-@pytest.mark.parametrize("sex", SEX)
-def test_the_links_carry_the_mass_and_the_first_moment_of_their_segments(table, sex):
-    wearer = Wearer(60.0, sex, table, LENGTHS)
-    mass, cog = wearer.on_links(LINKS)
-    (upper, upper_cog), (forearm, forearm_cog), (hand, hand_cog) = wearer.segments
-    assert mass == pytest.approx((0, 0, upper, forearm + hand))
-    assert mass * cog == pytest.approx((0, 0, upper * upper_cog, forearm * forearm_cog + hand * (0.27 + hand_cog)))
 
 
 def test_a_forearm_in_several_links_has_forearm_and_hand_each_at_their_own_place():

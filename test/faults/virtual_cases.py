@@ -460,15 +460,11 @@ MOTORS = (
 DESCENT = (
     FaultCase("arm disabled, upright overhead", happens("disable"),
         replace(with_friction(0.01, viscous=[0.0] * 4), pose=(0.0, 2.9, 0.0, 0.0)), outcomes=OFF),
-    FaultCase("arm disabled, bent, on a tilted trunk", happens("disable"), BENT, outcomes=OFF),
-    # The largest damping is then 3 Nm s/rad at the joint: no motor is taken for one that is off.
-    FaultCase("arm disabled, motors of 0.6 of the torque", happens("disable"), WEAK_MOTORS, outcomes=OFF),
     FaultCase("enabled again while let down", happens("enable"), PAPER, stage="letting down", outcomes=OFF),
     FaultCase("motor 2 cut off for 2 s while let down", in_turn(CUT_OFF, pause(2.0), CONNECT), PAPER,
         stage="letting down"),
     # While it is without power the arm falls freely: 0.3 rad/s in 15 ms, on top of the descent's speed.
     FaultCase("motor 2 restarts in 15 ms while let down", SHORT_RESTART, PAPER, stage="letting down", steps_from=0.3),
-    FaultCase("foreign EXIT to motor 2 while let down", exit_frame, PAPER, stage="letting down", steps_from=0.05),
 )
 START = (
     FaultCase("motor 2 reports an error while checking", ERROR, CHECKED, stage="checking", clear=NO_ERROR,
@@ -492,16 +488,12 @@ START = (
 )
 EFFORTS = (
     FaultCase("compensator frozen, the rest runs on", freeze, ALONE, clear=resume, outcomes=("command_stale",)),
-    FaultCase("compensator's step raises an exception", change_efforts(lambda now, effort: [0.0 / 0.0]), ALONE,
-        outcomes=("command_stale",)),
     FaultCase("effort NaN", happens("efforts_nan"), COMMANDED),
     FaultCase("NaN joint states", unknown_states, PAPER, outcomes=("command_withdrawn",)),
     FaultCase("NaN tilt", lambda rig: setattr(rig, "imu_frozen", TrunkReading((math.nan,) * 3)), PAPER,
         limit=PROCESS_REACTION, outcomes=("command_withdrawn",)),
     FaultCase("impossible parameters", set_impossible_parameters, PAPER, limit=None, outcomes=("active",)),
     FaultCase("no efforts", happens("efforts_withdrawn"), COMMANDED),
-    FaultCase("efforts 3 times too large", change_efforts(lambda now, effort: [3.0 * each for each in effort]),
-        MONITORED, limit=0.5, outcomes=UNEXPLAINED),
     FaultCase("efforts oscillate at 8 Hz",
         second(lambda now, effort: effort + TREMOR * math.sin(16.0 * math.pi * now)), MONITORED, limit=0.5,
         outcomes=UNEXPLAINED),
@@ -519,7 +511,6 @@ ARMS = (
         outcomes=("active",), clear=in_turn(bow(0.1), pause(4.0))),
     FaultCase("elbow pushed into the soft wall", happens("wearer", steps=WALL_PUSH), AT_WALL, None, speed_limit=5.0,
         check=not_thrown_back),
-    FaultCase("motor 2 reports an error, Zero-G, 75 kg", ERROR, WORN, clear=NO_ERROR, outcomes=("motor_error",)),
 )
 V3_BOARDS = (
     FaultCase("V3 boards: foreign exit of motor 2, once", exit_frame, ON_V3, steps_from=0.05,
@@ -531,8 +522,6 @@ SUPPLY = (
     FaultCase("supply cut, the arm laid in the lap, then clear and enable", stop_in_the_lap, PAPER,
         unpowered=ALL_JOINTS, steps_from=0.1, check=stays_off),
     supply_case("supply cut for 2 s", CUT, pause(2.0)),
-    supply_case("V3 boards: supply cut for 3 s, motor 2 back 6 s before the others", CUT, pause(3.0), power(True, 1),
-        pause(6.0), arm=ON_V3),
 )
 OUTER_LOOP = (
     outer_loop_case("outer loop stops", outer_loop(silent=True), "stopped"),
@@ -547,7 +536,6 @@ OUTER_LOOP = (
 )
 LOAD_CHANGES = (
     load_case("Zero-G to One-G, 75 kg", {"mode": "one_g"}, {"mode": "zero_g"}),
-    load_case("max_effort 9 to 0.5 Nm, Zero-G, 75 kg", WEAK, RATED),
     FaultCase("a load of 2 kg is dropped, Zero-G, 75 kg", take_and_drop, LOADED, limit=None, outcomes=("active",),
         speed_limit=DROP_SPEED, afterwards=load_is_withdrawn),
     FaultCase("the arm leaves the cuff, Zero-G, 75 kg", happens("out_of_cuff"), WORN, limit=EMPTY,
@@ -563,8 +551,6 @@ FIRMWARE = (
         "motor_silent")),
     # The steps are the firmware's own; test_motors.py judges the return.
     stopped(75),
-    FaultCase("all motors mute for 4 s", mute(*ALL_JOINTS), PAPER, speed_limit=CARELESS, driven_limit=CARELESS,
-        outcomes=("motor_silent",)),
     FaultCase("motor 2 mute for 4 s", mute(1), PAPER, outcomes=("motor_silent",), driven_limit=0.6),
     FaultCase("motor 2 reports an encoder error, then clear and enable", ERROR, PAPER,
         afterwards=lambda rig: enabled_in_vain(rig, pause(4.0)), outcomes=("motor_error",)),
@@ -604,6 +590,20 @@ FURTHER = (
     while_wearer("throws the arm", THROW, 0.2, energy_limit=0.5),
     while_wearer("pushes down", PUSH_DOWN, 0.2),
     FaultCase("imu silent while ramping in", happens("imu_silent"), CHECKED, PROCESS_REACTION, "ramping in"),
+    FaultCase("arm disabled, bent, on a tilted trunk", happens("disable"), BENT, outcomes=OFF),
+    # The largest damping is then 3 Nm s/rad at the joint: no motor is taken for one that is off.
+    FaultCase("arm disabled, motors of 0.6 of the torque", happens("disable"), WEAK_MOTORS, outcomes=OFF),
+    FaultCase("motor 2 reports an error, Zero-G, 75 kg", ERROR, WORN, clear=NO_ERROR, outcomes=("motor_error",)),
+    load_case("max_effort 9 to 0.5 Nm, Zero-G, 75 kg", WEAK, RATED),
+    supply_case("V3 boards: supply cut for 3 s, motor 2 back 6 s before the others", CUT, pause(3.0), power(True, 1),
+        pause(6.0), arm=ON_V3),
+    FaultCase("all motors mute for 4 s", mute(*ALL_JOINTS), PAPER, speed_limit=CARELESS, driven_limit=CARELESS,
+        outcomes=("motor_silent",)),
+    FaultCase("efforts 3 times too large", change_efforts(lambda now, effort: [3.0 * each for each in effort]),
+        MONITORED, limit=0.5, outcomes=UNEXPLAINED),
+    FaultCase("compensator's step raises an exception", change_efforts(lambda now, effort: [0.0 / 0.0]), ALONE,
+        outcomes=("command_stale",)),
+    FaultCase("foreign EXIT to motor 2 while let down", exit_frame, PAPER, stage="letting down", steps_from=0.05),
 )
 OTHER_ARMS = (
     *rows_of("elbow, AK80-64", ELBOW, lets_go=False),

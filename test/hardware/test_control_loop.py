@@ -51,13 +51,6 @@ def fail(*_: object) -> None:
     raise ZeroDivisionError("division by zero")
 
 
-def test_stopping_lets_the_arm_down_and_switches_the_motors_off():
-    arm = raised()
-    assert arm.loop.stop()
-    arm.assert_down()
-    assert not arm.notes.drive.powered and not arm.loop.cycle()
-
-
 def test_an_arm_is_let_down_after_its_computer_was_suspended():
     arm = raised()
     arm.clock.slept += 0.9  # less may be a thread that was not run
@@ -213,19 +206,6 @@ def test_our_own_frames_are_never_foreign():
 FORMATS = pytest.mark.parametrize("wire_format", quick([MIT], [MIT, MIT_V3]), ids=["mit", "mit_v3"])
 
 
-@FORMATS
-def test_an_arm_on_two_buses_is_carried_and_each_motor_is_commanded_on_its_own(wire_format: WireFormat) -> None:
-    arm = raised(channel=ON_TWO, wire_format=wire_format)
-    before, counted = arm.loop.incomplete, arm.loop.cycles
-    listeners = {name: Responder(wire) for name, wire in arm.wires.items()}
-    arm.run(1.0)
-    assert arm.fastest < 0.05 and arm.loop.cycles > counted + 100 and arm.loop.incomplete == before
-    heard = {name: {frame.arbitration_id & 0x7F for frame in end.received} - {0} for name, end in listeners.items()}
-    assert heard == {FIRST: {1, 2}, SECOND: {3, 4}}
-    arm.safety.disable(arm.now)
-    arm.assert_let_down()
-
-
 def test_both_buses_are_sent_their_commands_before_the_replies_of_either_are_awaited() -> None:
     """The replies take 0.2 to 0.4 ms on each bus: awaited one after the other they take longer than together."""
     arm = CarriedArm(channel=ON_TWO)
@@ -254,7 +234,7 @@ LOST = [(MIT, SECOND, *SILENT), (MIT, FIRST, *SILENT), (MIT_V3, SECOND, *SILENT)
 
 @pytest.mark.parametrize(
     ("wire_format", "dead", "lose", "code", "said"),
-    quick([LOST[0], LOST[-1]], LOST),
+    quick(LOST[:1], LOST),
     ids=lambda value: getattr(value, "__name__", ""),
 )
 def test_a_bus_that_is_lost_lets_the_whole_arm_down_and_its_motors_once_they_are_reached(

@@ -27,13 +27,13 @@ from exo_gravity.core.motors.joint_motor import LARGEST_WARMING, JointMotor
 from exo_gravity.core.numbers import NO_TORQUE
 from exo_gravity.core.safety.drive import Drive, Send, State
 from exo_gravity.core.safety.limits import DAMPING
-from exo_gravity.hardware.can_port import CanPort, message_of
+from exo_gravity.hardware.can_port import CanPort
 from exo_gravity.hardware.motor_bus import CONTEST_TIME, HOLD_STIFFNESS, WARMING, MotorBus
 from exo_gravity.sim import ArmConfig, Firmware, SimulatedArm, SimulatedDevice, SimulatedMotor
 from exo_gravity.sim.virtual_time import VirtualBus, Wire
 
 from ..support.simulated_device import OFF, drive_of, frame, joints_of, sending
-from .arms import CYCLE, CarriedArm, motor_bus
+from .arms import CarriedArm, motor_bus
 
 AK60 = MOTORS["AK60-6"]
 MOUNTED = (("AK60-6", 1, 0.0), ("AK80-9", -1, 0.4), ("AK60-6", 1, -0.2), ("AK60-6", 1, 0.0))
@@ -135,18 +135,6 @@ def test_a_motor_that_another_sender_commands_holds_its_joint_for_a_while(bus, d
     assert answer(bus, other, contested).kp == 0.0
 
 
-def test_after_a_foreign_set_zero_the_motor_damps_and_does_not_hold(bus, device, other):
-    bus.exchange(ON, now(bus) + 1.0)
-    sent(other)
-    other.send(frame(2, SET_ZERO))
-    bus.receive_until(now(bus) + 1.0, lambda: bus.foreign_commands > 0)
-    for _ in range(3):
-        bus.exchange(ON, now(bus) + 0.1)
-    answers = commands(other, MOTORS_OF_ARM[1])
-    assert {command.kp for command in answers} == {0.0}
-    assert {command.kd for command in answers} == {DAMPING}
-
-
 REPLY = pack_reply(AK60, 1, 0.25, 0.0, 0.0, 30, 0)
 
 
@@ -226,12 +214,6 @@ V3 = (MIT_V3,) * 4
 CARRYING = drive_of((0.0, 0.5, 0.4, 0.0))
 
 
-@pytest.fixture
-def mixed(wire) -> MotorBus:
-    """The bridge's end of a bus with both kinds of boards."""
-    return motor_bus(wire, joints_of(MIXED))
-
-
 REPLYING = [(reply, length) for reply in (False, True) for length in (8, 7, 6)]
 BOARDS = [(MIXED, Firmware(status_rate=100.0)), (V3, Firmware(status_rate=100.0))]
 BOARDS += [((MIT,) * 4, Firmware(*of_master)) for of_master in REPLYING]
@@ -257,33 +239,7 @@ def test_every_motor_is_read_and_a_v3_board_that_is_off_is_sent_only_its_exit(wi
     assert not bus.ignored
 
 
-V3_IDS = [joint.command_id for joint in joints_of(MIXED) if joint.wire_format is MIT_V3]
 # Foreign frames, and the IDs of the frames that oppose them.
-OPPOSED = [
-    *([(EXTENDED | mode << 8 | 2, bytes(8))] for mode in (0, 1, 5, 8)),
-    [(EXTENDED | 0x8FF, bytes(8))],  # a broadcast that every V3 board obeys
-    [(1, EXIT), (EXTENDED | 0x102, bytes(4))],  # switched on again, then our commands
-]
-ANSWERS = [*[V3_IDS[:1]] * 4, V3_IDS, [1, 1, V3_IDS[0]]]
-
-
-@pytest.mark.parametrize(("foreign", "answering"), [*zip(OPPOSED, ANSWERS, strict=True)])
-def test_a_foreign_command_to_a_v3_board_is_counted_and_opposed(mixed, other, foreign, answering) -> None:
-    joints, bus = joints_of(MIXED), mixed
-    bus.exchange(CARRYING, now(bus))
-    sent(other)
-    for message in foreign:
-        other.send(message_of(message))
-    bus.receive_until(now(bus) + CYCLE)
-    answers = sent(other)
-    assert sorted(frame_id for frame_id, _ in answers) == sorted(answering)
-    assert bus.foreign_commands == len(set(answering)) and bus.is_contested
-    assert "commands motor" in bus.foreign_command
-    assert (answers[0] == (1, ENTER)) == (answering[0] == 1)
-    answer = joints[1].wire_format.unpack_command(joints[1].spec, dict(answers)[V3_IDS[0]])
-    assert (answer.torque, answer.kd) == (pytest.approx(0.5, abs=0.2), pytest.approx(DAMPING, abs=0.01))
-
-
 @pytest.mark.parametrize("wire_format", [MIT, MIT_V3], ids=["v2", "v3"])
 def test_another_host_that_drives_motors_which_are_off_is_a_fault_until_it_stops(wire_format) -> None:
     arm = CarriedArm(joints_of((wire_format,) * 4))

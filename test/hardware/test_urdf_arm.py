@@ -27,7 +27,6 @@ from exo_gravity.core.safety.explain import GRAVITY, MotionMonitor
 from exo_gravity.core.safety.limits import DAMPING, Limits
 from exo_gravity.hardware.bus_lock import ArmNotes, DriveNotes
 from exo_gravity.hardware.urdf_arm import UrdfArm
-from exo_gravity.lab.calibration.moment_model import DescribedModel
 from exo_gravity.lab.inputs.arms import configured_arm
 from exo_gravity.lab.inputs.parameter_file import packaged_config
 from exo_gravity.sim.urdf import UrdfConfig
@@ -165,24 +164,6 @@ def branched() -> UrdfArm:
     with pytest.raises(ParameterError, match="j5"):
         arm.follow(["j1"], [1.0])  # which leaves the others where they were
     return arm
-
-
-@pytest.mark.parametrize("count", [1, 3, 7, 0], ids=lambda count: f"{count} joints" if count else "branches")
-def test_many_poses_at_once_have_the_torques_and_moments_that_each_has_alone(count):
-    random = np.random.default_rng(5)
-    arm = worn(count, random) if count else branched()
-    theta = random.uniform(-3.0, 3.0, (POSES, len(arm.names)))
-    tilts = [Tilt.of_gravity("left", random_gravity(random)) for _ in theta]
-    each = [arm.torque(pose, tilt) for pose, tilt in zip(theta, tilts, strict=True)]
-    assert np.allclose(arm.torques(theta, [tilt.direction for tilt in tilts]), each, rtol=0.0, atol=1e-12)
-    assert np.max(np.abs(each)) > 1.0
-    if count:
-        model, down = DescribedModel(arm, True), np.array([tilt.gravity_in_trunk for tilt in tilts])
-        rows = model.rows(theta, down) * arm.gain[:, None]
-        for k, more in enumerate(np.eye(rows.shape[-1])):
-            changed = arm.corrected(arm.change + 0.1 * model.in_links(more))
-            with_more = [changed.torque(pose, tilt) for pose, tilt in zip(theta, tilts, strict=True)]
-            assert np.allclose(np.subtract(with_more, each), 0.1 * rows[:, :, k], rtol=0.0, atol=1e-12)
 
 
 def test_one_pose_is_where_pinocchio_has_it_and_as_it_is_among_many():

@@ -106,7 +106,8 @@ def test_every_node_takes_its_parameters_and_every_arm_is_made_of_them(file: str
         assert arm.can_bridge["start_pose"] == CONFIRM  # the one thing that is new to them
 
 
-@pytest.mark.parametrize("file", quick(["sim"], ["sim", "sim_both"]))
+@pytest.mark.thorough
+@pytest.mark.parametrize("file", ["sim", "sim_both"])
 def test_every_simulated_arm_is_carried_through_a_trial(file: str) -> None:
     for trial in simulated_trials(THEN / f"{file}.yaml", script_to([0.1, 0.6, 1.2, 0.5])):
         recording = trial.run()

@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 from scipy.integrate import quad
 
-from exo_gravity.core.errors import DataError
 from exo_gravity.lab.report.cohort import LEAST, spectral_arc_length
 from exo_gravity.lab.trial.analysis import HoldCriteria, analyse, failures
 from exo_gravity.lab.trial.recording import ARRAYS, ScriptedStep
@@ -198,17 +197,6 @@ def test_a_limit_on_the_rate_names_the_joint_that_exceeds_it_in_holds_that_are_l
     (sentence,) = failed(creeping, max_rate=0.2 * DEG_PER_MIN)
     assert "right_joint_4 drifted 0.5" in sentence and "more than 0.20" in sentence
     assert failed(creeping, max_rate=0.2 * DEG_PER_MIN, rated_from=30.0) == []
-
-
-def test_joints_are_put_in_the_order_asked_for_and_others_are_refused():
-    whole = two_poses()
-    names = whole.joint_names[::-1]
-    turned = whole.in_order(names)
-    assert turned.joint_names == names
-    for field in ARRAYS:
-        np.testing.assert_array_equal(getattr(turned, field), getattr(whole, field)[:, ::-1])
-    with pytest.raises(DataError, match=r"^right: "):
-        whole.in_order(("a", "b", "c", "d"))
 
 
 BELL = np.exp(-5.0 * np.arange(-1.0, 1.0, 1.0 / 100.0) ** 2)

@@ -11,7 +11,6 @@ import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import replace
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -25,7 +24,7 @@ from rclpy.executors import SingleThreadedExecutor
 from rclpy.parameter import Parameter
 from rclpy.time import Time
 from sensor_msgs.msg import Imu, JointState
-from std_msgs.msg import Float64MultiArray, Header, String
+from std_msgs.msg import Float64MultiArray, String
 from std_srvs.srv import Trigger
 
 from exo_gravity.core import gravity_torque
@@ -36,18 +35,15 @@ from exo_gravity.core.compensation.compensator import Compensator
 from exo_gravity.core.compensation.settings import COMPENSATOR
 from exo_gravity.core.errors import ParameterError
 from exo_gravity.core.safety import guidance as guided
-from exo_gravity.core.safety.limits import CAN_BRIDGE
 from exo_gravity.hardware.network import keep_to_this_machine
 from exo_gravity.hardware.urdf_arm import UrdfArm
 from exo_gravity.lab.inputs.arms import read_arm
-from exo_gravity.lab.inputs.parameter_file import packaged_config
 from exo_gravity.nodes.compensator import arm
 from exo_gravity.nodes.compensator.node import CompensatorNode
 from exo_gravity.nodes.ros.inner import NodeExecutor
 from exo_gravity.nodes.ros.messages import to_nanoseconds
 from exo_gravity.nodes.ros.subscriptions import LATCHED
 from exo_gravity.nodes.wearer import WearerNode
-from exo_gravity.tools import train_anfis
 
 from ..support import CONFIG, PARTS, ROBOT
 from ..support.chains import random_chain
@@ -374,39 +370,6 @@ def test_a_load_is_weighed_on_request_and_one_that_is_dropped_is_no_longer_a_par
     assert rig.node.get_parameter("payload.mass").value == 0.0
 
 
-@pytest.mark.thorough
-def test_a_second_sender_of_requests_raises_no_support(make_rig):
-    """Wrong requests: test/core/test_support_request.py."""
-    rig = make_rig("/right", ADAPTIVE, NAMES, POSE).start()
-
-    def asking(share: float) -> Callable[[Time], None]:
-        """Return a sender that asks for a share 0..1."""
-        publisher = rig.user.create_publisher(JointState, "support_request", 1)
-        request = partial(JointState, name=["support"], position=[share])
-        return lambda stamp: publisher.publish(request(header=Header(stamp=stamp)))
-
-    rig.wait_for({"support in use": "0.4"})
-    rig.on_cycle = ask = asking(0.8)
-    rig.wait_for({"support in use": "0.8"})
-    other = asking(0.9)
-    rig.on_cycle = lambda stamp: (ask(stamp), other(stamp))
-    rig.wait_for({"support in use": "0.4", "support request": "second_publisher"})
-
-
-@pytest.mark.thorough
-def test_the_anfis_law_runs_from_its_file_and_the_exact_law_replaces_it_outside_its_training(
-    rig, tmp_path, monkeypatch
-):
-    monkeypatch.setenv("HOME", str(tmp_path))
-    assert train_anfis.main(["--params", str(CONFIG / "sim.yaml"), "--output", str(tmp_path / "anfis.json")]) == 0
-    both = [Parameter("law", value="anfis"), Parameter("anfis_file", value="~/anfis.json")]
-    assert rig.node.set_parameters_atomically(both).successful
-    rig.wait_for({"law in use": "anfis", "state": "compensating"})
-    assert rig.set(mode="zero_g", support=1.0, wearer__body_mass=75.0) == [""] * 3
-    message = "the exact law replaces anfis: the ANFIS was trained for another arm"
-    rig.wait_until(lambda: message in rig.status.message)
-
-
 def is_zero(rig: CompensatorRig) -> bool:
     return bool(rig.commands) and not any(rig.commands[-1])
 
@@ -600,28 +563,6 @@ def test_beside_a_compensator_that_hangs_nothing_is_known_of_the_wearer(make_rig
     rig.wait_until(lambda: len(torques) > told and rig.torques == NONE)
 
 
-@pytest.mark.thorough
-def test_a_load_beyond_the_motors_is_clamped_and_one_warning_states_the_support_that_fits(make_rig, capfd):
-    rig = make_rig("/right", {"use_imu": "false"}, NAMES, POSE)
-    bridge = rig.add(rclpy.create_node("can_bridge"))
-    for param in CAN_BRIDGE:
-        bridge.declare_parameter(param.name, param.default)
-    rig.start(with_wearer=True)
-    rig.wait_until(lambda: rig.found("budget") == "within_rated")
-    worn = {"mode": "zero_g", "support": 1.0, "wearer.body_mass": 75}
-    changes = [Parameter(name, value=value) for name, value in worn.items()]
-    assert rig.node.set_parameters_atomically(changes).successful
-    needs = "right_shoulder_abduction needs 19.6 Nm in its worst pose (rated 9, peak 18)"
-    rig.wait_until(lambda: needs in rig.found("budget text"))
-    assert rig.found("budget") == "above_rated"
-    assert f"the largest support that fits is {rig.found('largest support')}" in rig.found("budget text")
-    rig.wait_until(lambda: ", right_shoulder_flexion" in rig.status.message and rig.commands[-1][2] == 3.0)
-    rig.statuses.clear()
-    rig.wait_until(lambda: rig.found("budget text"))  # the next report does not repeat the warning
-    warnings = [line for line in capfd.readouterr().err.splitlines() if needs in line]
-    assert len(warnings) == 1 and "WARN" in warnings[0]
-
-
 @pytest.fixture
 def alone() -> Iterator[NodeRig]:
     """A rig with a wearer, `alone.wearer`."""
@@ -640,23 +581,6 @@ def test_a_node_of_another_program_with_the_compensators_name_does_not_end_the_n
     other.create_timer(0.05, lambda: publisher.publish(report))
     alone.wait_until(lambda: alone.statuses["wearer"].message == "the compensator has no parameter 'law'")
     assert alone.wearer.failure is None
-
-
-@pytest.mark.thorough
-def test_the_wearers_torque_on_an_arm_of_three_joints_is_known_once_its_urdf_arrives(make_rig):
-    names, pose, given = ["abduction", "flexion", "elbow"], [0.4, 0.5, 0.7], np.array((1.0, -2.0, 0.5))
-    text = packaged_config("arms/three_joints.urdf").read_text(encoding="utf-8")
-    urdf = {"urdf.topic": "/robot_description", "urdf.hand": "hand", "max_effort": [30.0] * 3}
-    rig = make_rig(
-        "/right", {"law": "urdf", "use_imu": "false", "joint_names": f"[{','.join(names)}]", **urdf}, names, pose
-    )
-    rig.effort = np.subtract(UrdfArm(text, names).torque(pose, Tilt.of("left")), given).tolist()
-    rig.user.create_publisher(String, "/robot_description", LATCHED).publish(String(data=text))
-    rig.start(with_wearer=True)
-    torques = rig.estimates[""]
-    rig.wait_until(lambda: len(torques) > 50)
-    assert list(torques[-1].name) == names and torques[-1].effort == pytest.approx(given, abs=1e-6)
-    assert rig.found("budget") == "unknown"
 
 
 @pytest.mark.thorough

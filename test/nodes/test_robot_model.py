@@ -1,7 +1,6 @@
 # Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
 """The node `robot_model` in this process, with what the nodes of both arms publish; and the viewers' layouts."""
 
-import ast
 import re
 from collections.abc import Iterator
 
@@ -19,7 +18,6 @@ from exo_gravity.core.params import table_for, values_of
 from exo_gravity.core.safety.limits import CAN_BRIDGE
 from exo_gravity.hardware.network import keep_to_this_machine
 from exo_gravity.lab.inputs.parameter_file import load
-from exo_gravity.lab.processes import node_modules
 from exo_gravity.lab.view import ROOT
 from exo_gravity.nodes.robot_model import RobotModel
 from exo_gravity.nodes.ros.subscriptions import LATCHED
@@ -139,16 +137,3 @@ def test_a_layout_names_topics_fields_and_frames_that_exist(layout):
     found = re.findall(r"[\s\";](/[a-z][\w/.\[\]]*)", text)
     assert found and not [name for name in found if not SHOWN.fullmatch(name)]
     assert {*re.findall(r"(?:Fixed Frame: |\"followTf\": \")(\w+)", text)} <= {ROOT}
-
-
-def test_rviz_subscribes_with_the_quality_of_service_that_the_topics_have_and_the_launch_file_names_what_exists():
-    displays = yaml.safe_load((CONFIG / "rviz" / "exo.rviz").read_text("utf-8"))["Visualization Manager"]["Displays"]
-    topics = [each[key] for each in displays for key in each if key in ("Description Topic", "Topic")]
-    assert {topic["Value"]: topic["Durability Policy"] for topic in topics} == {
-        "/robot_description": "Transient Local",
-        "/robot_model/markers": "Volatile",
-    }
-    tree = ast.parse((CONFIG.parent / "launch" / "view.launch.py").read_text(encoding="utf-8"))
-    texts = {node.value for node in ast.walk(tree) if isinstance(node, ast.Constant)}
-    assert {"robot_model", "robot_state_publisher", "rviz2", "sim.yaml", "rviz/exo.rviz"} <= texts
-    assert "robot_model" in node_modules() and (CONFIG / "rviz/exo.rviz").is_file()

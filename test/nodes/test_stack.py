@@ -157,15 +157,6 @@ def test_motors_that_were_left_on_are_let_down_where_no_log_file_can_be_opened(p
     assert done.returncode == 0
 
 
-def test_a_compensator_without_a_parameter_file_starts_and_waits_for_joint_states(probe):
-    process = subprocess.Popen([executable("compensator"), "--ros-args", "-r", "__ns:=/right"])
-    try:
-        probe.wait_until(lambda: probe.status_contains("compensator", "waiting for joint_states"))
-    finally:
-        process.send_signal(signal.SIGINT)
-        assert process.wait(PATIENCE) == 0
-
-
 @pytest.mark.thorough
 @pytest.mark.real_time
 def test_in_one_process_both_nodes_have_their_own_names_carry_the_arm_and_let_it_down(launch, probe):

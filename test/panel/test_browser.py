@@ -12,7 +12,6 @@ from typing import Any
 
 import pytest
 
-from ..support import PARTS
 from ..support.panel_stage import WEARER_FILE
 
 pytest.importorskip("playwright", reason="no browser driver: install the extra test")
@@ -372,20 +371,6 @@ def test_the_share_that_the_wearer_carries_is_shown_with_its_band_while_it_means
     assert page.inner_text(figure) == "–"
 
 
-def test_a_plot_without_a_curve_says_why_and_all_are_as_wide_as_their_place(visit, stage):
-    stage.arms.silent = {"left"}
-    stage.arms.reports["right"] = {f"right_{part} temperature (degC)": "unknown" for part in PARTS}
-    page = visit(width=1280)  # two plots in a row
-    wait_for_text(page, "#plots-blank", "Left arm: Blank: no angles have arrived")
-    wait_for_text(page, ".blank", "report no temperature")
-    stage.arms.reports.clear()
-    stage.arms.silent = set()
-    wait_until(page, lambda: page.locator(".blank:has-text('temperature')").count() == 0)
-    wait_until(page, lambda: page.locator(".plots figure").count() == 8)
-    widths = "figures => figures.map(figure => [figure.clientWidth, figure.querySelector('.u-wrap').clientWidth])"
-    wait_until(page, lambda: all(a == b for a, b in page.eval_on_selector_all(".plots figure", widths)))
-
-
 def test_the_page_says_which_arm_is_simulated_as_the_devices_say(page, stage):
     wait_for_text(page, "#source", "SIMULATED")
     stage.arms.simulator, stage.arms.reports["right"] = None, {"source": "real"}
@@ -569,26 +554,6 @@ def test_on_every_screen_let_down_stays_in_sight_nothing_is_cut_off_and_no_state
     assert temperature["x"] + temperature["width"] <= card["x"] + card["width"]
     for column in (0, 1):
         assert page.evaluate(TALLEST, column) == 0.0  # no text of a fault is longer than its place
-
-
-def test_at_1280_by_800_a_training_is_on_one_screen_and_on_a_phone_the_remedy_comes_before_who_operates(visit, stage):
-    stage.arms.names = ("right",)
-    del stage.arms.settings["left"]
-    page = visit(width=1280, height=800, folded=True)
-    page.wait_for_selector("#plots figure >> nth=1")
-    boxes = [
-        page.locator(part).bounding_box()
-        for part in (
-            *map(of_arm, (".lead .badge", ".tell", ".enable", ".modes", ".support input", ".carries")),
-            *("#control", "#picture", "#plots figure >> nth=0", "#plots figure >> nth=1"),
-        )
-    ]
-    assert max(box["y"] + box["height"] for box in boxes) <= page.locator("footer").bounding_box()["y"]
-    assert boxes[-3]["width"] >= 600  # the picture: three views side by side
-    wait_until(page, lambda: page.locator("#picture span").count() == 3)
-    page.set_viewport_size({"width": 390, "height": 844})
-    remedy, control = (page.locator(part).bounding_box() for part in (of_arm(".remedy"), "#control"))
-    assert remedy["y"] + remedy["height"] < min(control["y"], 400)
 
 
 def test_the_page_is_german_when_its_user_or_their_browser_wants_it(page, browser, stage):

@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 from exo_gravity.core import ArmModel, Tilt, gravity_torque
 from exo_gravity.core.arm.interface import NO_LOAD, STANDARD_GRAVITY
 from exo_gravity.sim import STEP, ArmConfig, SimulatedArm, SimulatedDevice
-from exo_gravity.sim.arm import DEFAULT_LINKS, felt_in_base, in_base
+from exo_gravity.sim.arm import felt_in_base, in_base
 from exo_gravity.sim.trunk_motion import TrunkState
 
 from ..support.calibration_device import off_axis_of
@@ -73,13 +73,6 @@ def test_the_exact_torque_holds_the_arm_and_an_imbalance_beyond_friction_moves_i
     arm.reset(RAISED)
     torque = gravity_torque(arm.config.links, RAISED) + imbalance
     assert least <= moved(arm, torque, 1.0 if least else 10.0) < most
-
-
-def test_the_elbow_has_the_inertia_of_its_tube_and_of_the_rotor():
-    arm, column = SimulatedArm(ArmConfig(rotor_inertia=(0.0, 0.0, 0.0, 0.01))), np.zeros(4)
-    mujoco.mj_mulM(arm.model, arm.data, column, np.array((0.0, 0.0, 0.0, 1.0)))
-    length, mass, cog = (float(values[3]) for values in (DEFAULT_LINKS.length, DEFAULT_LINKS.mass, DEFAULT_LINKS.cog))
-    assert column[3] == pytest.approx(mass * (length**2 / 12 + 0.03**2 / 2 + cog**2) + 0.01)
 
 
 @pytest.mark.parametrize("joint", range(4))

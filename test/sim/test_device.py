@@ -11,9 +11,9 @@ import can
 import pytest
 
 from exo_gravity.core.errors import BusError
-from exo_gravity.core.motors.ak import MIT, MIT_V3, unpack_reply
-from exo_gravity.core.motors.frames import ENTER, EXIT, ID_BITS
-from exo_gravity.sim import Firmware, VirtualWearer
+from exo_gravity.core.motors.ak import unpack_reply
+from exo_gravity.core.motors.frames import ENTER, EXIT
+from exo_gravity.sim import VirtualWearer
 from exo_gravity.sim import device as device_module
 from exo_gravity.sim.arbitration import TAIL_BITS, frame_bits
 from exo_gravity.sim.script import TrialScript
@@ -153,13 +153,6 @@ class ScriptedBus:
         device.run(self, lambda: not self.script, *aside)
 
 
-def test_other_work_waits_until_every_command_has_been_answered(device, monkeypatch):
-    at_once = [(0.0, frame(can_id, command(can_id - 1))) for can_id in (1, 2, 3, 4)]
-    bus, answered = ScriptedBus([*at_once, *[(0.002, None)] * 5]), []
-    bus.run(device, monkeypatch, lambda now: answered.append(len(bus.sent)))
-    assert answered and set(answered) == {4}
-
-
 @pytest.mark.parametrize(
     ("waits", "simulated", "slip"),
     [([0.002] * 50, 0.1, 0.0), ([0.002, 0.04, 0.002], 0.044, 0.0), ([0.002, 0.3, 0.002], 0.054, 0.25)],
@@ -188,14 +181,6 @@ REGULAR = [(0.002, command(0))] * 5
 def test_stalls_and_silence_are_measured_while_the_motors_are_on(device, monkeypatch, script, stall, silence):
     ScriptedBus(script).run(device, monkeypatch)
     assert (device.longest_stall, device.longest_silence) == (pytest.approx(stall), pytest.approx(silence))
-
-
-def test_v3_boards_report_at_their_rate_and_missed_reports_are_not_made_up(monkeypatch):
-    device = make_device(Firmware(status_rate=100.0), formats=(MIT, MIT_V3, MIT, MIT))
-    bus = ScriptedBus([*[(0.001, None)] * 500, (1.0, None), *[(0.001, None)] * 400])
-    bus.run(device, monkeypatch)
-    assert {can_id for _, can_id, _ in bus.sent} == {MIT_V3.reply_id(2) & ID_BITS}
-    assert len(bus.sent) == pytest.approx(90, abs=3)
 
 
 def test_a_failing_bus_ends_the_run_with_a_bus_error(device):

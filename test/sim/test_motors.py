@@ -5,7 +5,6 @@ import struct
 from dataclasses import replace
 from typing import Any
 
-import numpy as np
 import pytest
 
 from exo_gravity.core.errors import ParameterError
@@ -100,30 +99,6 @@ def test_a_reply_is_in_motor_coordinates_and_its_zero_is_where_set_zero_found_th
     play(motor, SET_ZERO, position=0.3)
     for position, replied in ((0.3, 0.0), (0.5, -0.2)):
         assert reply_to(motor, ZERO, position, now=2.0).position == pytest.approx(replied, abs=2e-4)
-
-
-def test_replied_torques_are_noisy_and_readings_beyond_the_range_of_a_reply_are_clamped():
-    motor = motor_of(changes={"current_noise": 0.02})
-    play(motor, ENTER)
-    replied = [reply_to(motor, command(5.0)).torque for _ in range(500)]
-    assert (np.std(replied), np.mean(replied)) == pytest.approx((0.1, 5.0), abs=0.02)
-    motor.temperature = 300.0
-    reply = reply_to(motor, ZERO, position=-20.0, velocity=90.0)
-    assert (reply.position, reply.temperature) == (-SPEC.position_range, 215)
-    assert reply.velocity == pytest.approx(SPEC.velocity_range)
-
-
-def test_an_unplugged_motor_neither_replies_nor_gives_torque_and_comes_back_with_its_zero_alone():
-    motor = motor_of(zero=0.4)
-    play(motor, ENTER, PUSH)
-    motor.unplugged = True
-    assert motor.torque(0.0, 0.0) == 0.0 and play(motor, PUSH) == [None]
-    motor.unplugged = False
-    assert reply_to(motor, ENTER, position=0.1).position == pytest.approx(0.5, abs=2e-4)
-    assert motor.torque(0.0, 0.0) == 0.0
-    motor.strength = 0.8  # it reports what it is commanded
-    assert reply_to(motor, PUSH).torque == pytest.approx(2.0, abs=STEP)
-    assert motor.torque(0.0, 0.0) == pytest.approx(1.6, abs=STEP)
 
 
 def test_a_motor_that_gives_its_rated_torque_warms_by_its_rise_and_cools_again():
@@ -225,31 +200,6 @@ def test_the_vendors_error_byte_is_a_mask_its_positions_span_12_56_rad_and_heat_
     assert motor.entered and play(motor, PUSH)[0][7] == 0
 
 
-def test_next_to_its_special_frames_the_vendors_motor_leaves_the_bus_until_it_loses_power():
-    motor = motor_of("vendor")
-    assert play(motor, ENTER, NEXT_TO_IT)[1] is not None and motor.entered
-    assert play(motor, TO_BOOT_LOADER, ZERO, ENTER) == [None] * 3 and not motor.entered
-    without_power_for_a_moment(motor)
-    assert play(motor, ENTER)[0] is not None and motor.entered
-    for name in ("ak", "open_drive"):
-        motor = motor_of(name)
-        play(motor, ENTER, TO_BOOT_LOADER)
-        assert motor.torque(0.0, 0.0) == SPEC.peak_torque  # a command with every field near its maximum
-
-
-@pytest.mark.parametrize(
-    ("name", "data", "is_command"),
-    [("ak", PUSH[:6], False), ("ak", PUSH + bytes(1), False), ("vendor", b"", True), ("open_drive", PUSH[:6], True),
-     ("open_drive", b"", False)],
-)  # fmt: skip
-def test_short_and_remote_frames_are_ignored_or_filled_with_what_is_left_of_the_frame_before(name, data, is_command):
-    motor = motor_of(name, {"timeout": 0.01})
-    play(motor, ENTER, PUSH)
-    motor.advance(0.0, 0.0, 0.02)
-    assert (play(motor, data)[0] is not None) is is_command
-    assert motor.torque(0.0, 0.0) == pytest.approx(2.0 * is_command, abs=STEP)
-
-
 # V3 boards
 
 
@@ -284,15 +234,6 @@ def test_the_first_command_switches_a_v3_board_on_its_status_shows_angle_speed_a
     assert reported(motor).effort == 0.0
     motor.receive((2000).to_bytes(4, "big", signed=True), 0.5, 0.0, 0.0, V3.exit[0][0])
     assert motor.torque(0.5, 0.0) == pytest.approx(-0.8 * 2.0 * 0.2997)  # a current drives it
-
-
-def test_without_power_a_v3_board_reports_nothing_and_with_its_cable_it_ignores_commands():
-    motor = pushed()
-    motor.unplugged = True
-    assert reported(motor) is None and motor.torque(0.5, 0.0) == 0.0
-    motor.unplugged, motor.cable = False, True
-    motor.receive(V3.command(1.5, 0.0), 0.5, 0.0, 0.0, V3.command_id)
-    assert not motor.entered and reported(motor).effort == 0.0
 
 
 def test_a_v3_board_of_image_3_2_reads_its_torque_by_the_firmwares_constant_and_1_35_times_it_by_the_rated_ones():
@@ -417,15 +358,3 @@ def test_registers_are_told_and_what_is_written_counts_until_the_power_goes_unle
     assert last_torque(motor, 1.0) == pytest.approx(4.0, abs=0.02)  # the same code, another torque; and no time-out
     without_power_for_a_moment(motor)
     assert (ask(motor, TMAX), ask(motor, PMAX)) == pytest.approx((10.0, 12.566))
-
-
-def test_the_zero_survives_a_power_cycle_and_a_refresh_tells_the_state_which_no_other_mode_changes() -> None:
-    motor = DamiaoMotor(DAMIAO)
-    play(motor, ENTER)
-    refreshed = motor.receive(bytes((3, 0, 0xCC, 0, 0, 0, 0, 0)), 0.3, 0.0, 0.0, REGISTERS)
-    assert refreshed[0] == 0x13
-    assert refreshed == motor.receive(DAMIAO.command(5.0, 0.0), 0.3, 0.0, 0.0, 0x103)
-    assert last_torque(motor, 0.01) == 0.0 and [state(motor, data) for data in (EXIT, SET_ZERO)] == [0, 0]
-    without_power_for_a_moment(motor)
-    (reply,) = play(motor, EXIT, position=0.3)
-    assert DAMIAO_MIT.unpack_reply(DAMIAO.spec, 3, reply).position == pytest.approx(0.0, abs=0.001)

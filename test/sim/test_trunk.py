@@ -106,16 +106,6 @@ def test_readings_are_in_the_imus_own_axes_and_within_its_range(config, state, g
     np.testing.assert_allclose(seen, (gyroscope, accelerometer), atol=1e-12)
 
 
-def test_noise_has_the_configured_density_and_the_same_seed_gives_the_same_samples():
-    imus = [SimulatedImu(ImuConfig(rate=200.0, seed=seed)) for seed in (3, 3, 4)]
-    one, other, third = (np.array([imu.sample(UPRIGHT) for _ in range(4000)]) for imu in imus)
-    spread = one.std(axis=0) / math.sqrt(200.0 / 2)
-    np.testing.assert_allclose(spread[0], math.radians(0.007), rtol=0.05)
-    np.testing.assert_allclose(spread[1], 180e-6 * G, rtol=0.05)
-    np.testing.assert_array_equal(one, other)
-    assert not np.array_equal(one[0], third[0])
-
-
 @pytest.mark.parametrize(
     ("changes", "seeds", "expected"),
     [

@@ -212,12 +212,11 @@ def device_on(channel: str, arm: Arm) -> Iterator[SimulatedDevice]:
         thread.join()
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize(
     ("given", "found"),
-    [
-        pytest.param("near", "near", marks=pytest.mark.thorough, id="one bus"),
-        pytest.param("near,far,far,far", "far,near,near,far", id="two buses"),
-    ],
+    [("near", "near"), ("near,far,far,far", "far,near,near,far")],
+    ids=["one bus", "two buses"],
 )
 def test_the_command_line_describes_the_device_in_the_new_file_or_says_why_not(
     tmp_path: Path, run_tool: Callable[..., Ended], monkeypatch: pytest.MonkeyPatch, given: str, found: str

@@ -26,16 +26,14 @@ from scipy import stats
 from exo_gravity.core import ArmModel, Tilt, gravity_torque
 from exo_gravity.core.arm.tilt import gravity_in_trunk
 from exo_gravity.core.arm.wearer import Wearer
-from exo_gravity.core.params import values_of
 from exo_gravity.core.safety.drive import FaultCode
-from exo_gravity.core.safety.limits import CAN_BRIDGE, limits_of
 from exo_gravity.core.vocabulary import Source
 from exo_gravity.lab.bag.content import Event, NodeStatus
 from exo_gravity.lab.bag.reader import read_bag
 from exo_gravity.lab.inputs.arms import configured_arm
 from exo_gravity.lab.inputs.parameter_file import load
 from exo_gravity.lab.parallel import on_cluster
-from exo_gravity.lab.report import cohort, figures, html, study, wearer_share
+from exo_gravity.lab.report import cohort, html, study, wearer_share
 from exo_gravity.lab.report.trial_report import STAMPS, analyse, print_report, write
 from exo_gravity.lab.trial.analysis import HoldCriteria
 from exo_gravity.lab.trial.analysis import analyse as analysis_of
@@ -179,22 +177,6 @@ def test_a_figure_for_a_paper_has_its_size_letters_of_8_pt_embedded_fonts_and_th
     assert times and max(times) <= 9.0  # s
 
 
-def test_a_push_does_not_flatten_the_velocities_joints_differ_in_grey_and_near_limits_are_drawn(held):
-    ((recording, analysis),) = held.arms
-    names, low = list(recording.joint_names), math.radians(-5.0)
-    values = {"can.interface": "virtual", "can.channel": "a", "joint_names": names, "position_min": [low] * 4}
-    limits = limits_of(values_of(CAN_BRIDGE, values))
-    position, speed, torque = figures.overview(recording, analysis, limits=limits).axes
-    (push,) = [motion for motion in analysis.motions if motion.kind == "push"]
-    peak = math.degrees(push.speed.max())
-    assert speed.get_ylim()[1] < peak and [text.get_text() for text in speed.texts] == [f"to {peak:.0f}"]
-    curves = position.get_lines()[:4]
-    assert len({str(line._dash_pattern) for line in curves}) == 4
-    assert [line.get_ydata()[0] for line in position.get_lines()[4:]] == pytest.approx([-5.0] * 4)
-    commands = [line for line in torque.get_lines() if line.get_alpha()]
-    assert [line.get_color() for line in commands] == [line.get_color() for line in curves]
-
-
 REFUSED = {  # words, and what is said
     "a joint that it lacks": (["--joints", "5"], "joints = [5]: must be numbers from 1 to 4"),
     "a time that it lacks": (["--from", "100"], "must be a part of the recording, which lasts from 0.0 to"),
@@ -317,13 +299,6 @@ def test_what_the_nodes_say_of_the_source_is_believed_before_the_parameters(tmp_
     entries = [*made.messages(WHOLE), made.status(0.5, "active", state="active", source="real")]
     bag = read_bag(made.write_bag(tmp_path / "bag", entries))
     assert bag.source("right") is Source.REAL and bag.source("left") is Source.UNKNOWN
-
-
-def test_only_joints_that_moved_are_drawn_and_the_others_are_a_line(page_of):
-    report = analyse(made.bag_of(made.trial(made.POSES, hold=6.0, rate=100.0, drift=AWAY)))
-    titles = [axis.get_title(loc="left") for axis in figures.drift(*report.arms[0], report.criteria).axes]
-    assert [title for title in titles if title] == ["joint 4"]
-    assert re.search(r"none of joint 1, joint 2, joint 3 moved more than 0\.0\d\d degrees", page_of(report).text)
 
 
 LET_DOWN = replace(made.trial(made.POSES, hold=6.0, fall_after=12.5), carried=((0.0, 12.5),))  # and it fell
@@ -530,13 +505,6 @@ def test_when_a_worker_of_a_cluster_is_killed_no_recording_is_lost_and_none_is_t
                 os.kill(running.pop(), signal.SIGKILL)
 
         assert cohort.summaries(recordings, SUMMARY, partial(on_cluster, cluster.scheduler_address), done) == expected
-
-
-def test_a_scheduler_that_does_not_answer_is_one_line(trials, monkeypatch, run_tool):
-    monkeypatch.setattr("exo_gravity.lab.parallel.CONNECT", "0.1s")
-    ended = run_tool("report", trials, "--scheduler", "tcp://127.0.0.1:9")
-    (line,) = ended.err.splitlines()
-    assert ended.code == 2 and line.startswith("report: ") and "127.0.0.1:9" in line
 
 
 def test_a_move_along_a_bell_of_speed_is_smooth():

@@ -19,7 +19,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-import zstandard
 from mcap.writer import CompressionType
 from mcap.writer import Writer as McapWriter
 from rosbags.interfaces import Nodetype
@@ -124,18 +123,6 @@ def test_a_recording_cut_short_gives_the_chunks_before_and_one_that_lacks_only_i
     assert "cut short" in found.notes[0] and found.is_partial
 
 
-def test_a_damaged_chunk_is_left_out_and_named(tmp_path):
-    bag = made.write_bag(tmp_path / "bag", CONTENT * 12, compression=CompressionMode.STORAGE)
-    file = bag / "bag.mcap"
-    data = bytearray(file.read_bytes())
-    chunk = data.index(b"\x28\xb5\x2f\xfd", data.index(b"\x28\xb5\x2f\xfd") + 4)  # the second one
-    data[chunk + 4 : chunk + 40] = bytes(36)
-    file.write_bytes(data)
-    report, arm, _ = report_of(bag)
-    assert "the recording is damaged: parts left out: 1" in report.notes and report.bag.is_partial
-    assert len(TRIAL.time) < len(arm.time) < 12 * len(TRIAL.time)
-
-
 def test_a_write_ahead_log_on_a_read_only_medium_is_read(tmp_path):
     source = made.write_bag(tmp_path / "bag", CONTENT, StoragePlugin.SQLITE3) / "bag.db3"
     medium = tmp_path / "medium"
@@ -165,17 +152,6 @@ def test_of_two_files_that_hold_the_same_the_one_that_the_metadata_name_is_read(
     with pytest.raises(DataError, match=r"bag\.mcap and bag_recovered\.mcap are of different recordings"):
         read_bag(bag)
     made.assert_same(made.only(bag / "bag_recovered.mcap"), TRIAL)
-
-
-def test_names_in_capitals_and_files_that_a_person_compressed_are_read(tmp_path):
-    bag = made.write_bag(tmp_path / "bag", CONTENT)
-    capitals, compressed = tmp_path / "BAG.MCAP", bag / "bag.mcap.zst"
-    (bag / "bag.mcap").rename(capitals)
-    compressed.write_bytes(zstandard.compress(capitals.read_bytes()))
-    for path in (capitals, compressed, bag):
-        found = read_bag(path)
-        made.assert_same(found.recordings[0], TRIAL)
-        assert not any("metadata" in note for note in found.notes)
 
 
 TEXT = b"no recording at all, though long enough to look at\n" * 20

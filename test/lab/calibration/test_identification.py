@@ -27,7 +27,6 @@ from ...support.calibration_device import (
     LEANING,
     PAPERS,
     UPRIGHT,
-    WEIGHT,
     Device,
     best,
 )
@@ -85,14 +84,6 @@ def test_without_a_weight_moments_and_scales_are_relative_but_the_commanded_torq
     assert factor == pytest.approx(np.prod(device.scale[1:]) ** (-1.0 / 3.0), rel=0.01)
     np.testing.assert_allclose(found.moments / factor, device.moments, atol=0.004)
     np.testing.assert_allclose(found.scale / factor, device.scale, rtol=0.03)
-
-
-def test_a_light_weight_leaves_moments_and_scales_as_uncertain_as_each_other():
-    device = Device(3)
-    light = [device.observe(theta, weight=(0.05, 0.25)) for theta in best(LEANING, 4, WEIGHT)]
-    found = identify(device.tour(weighed=0) + light, PAPERS)
-    assert found.scale_error[1] > 0.01 * found.scale[1]
-    assert found.error[2] / found.moments[2] == pytest.approx(found.scale_error[2] / found.scale[2], rel=0.2)
 
 
 def test_with_an_upright_stand_joint_1_is_not_known_and_said_to_be():
@@ -265,7 +256,11 @@ def test_a_pose_with_a_slip_or_a_hand_is_left_out_and_named(slips):
 
 
 @pytest.mark.parametrize(
-    ("bare", "spoilt", "words"), [(30, 12, r"pose 17: effort of joint 1 is"), (8, 6, "off in half of the poses")]
+    ("bare", "spoilt", "words"),
+    [
+        pytest.param(30, 12, r"pose 17: effort of joint 1 is", marks=pytest.mark.thorough),
+        (8, 6, "off in half of the poses"),
+    ],
 )
 def test_poses_that_do_not_fit_one_arm_are_refused_together(bare, spoilt, words):
     observations = Device(7).tour(bare=bare)
