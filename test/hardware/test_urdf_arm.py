@@ -167,14 +167,12 @@ def branched() -> UrdfArm:
 
 
 def test_one_pose_is_where_pinocchio_has_it_and_as_it_is_among_many():
-    random = np.random.default_rng(6)
     arm = branched()
     model = pin.buildModelFromXML(BRANCHED)
     data = model.createData()
-    theta = random.uniform(-3.0, 3.0, (POSES, 3))
+    theta = np.random.default_rng(6).uniform(-3.0, 3.0, (POSES, 3))
     before, after, places = arm.frames(theta)
     for n, (j1, j3, j4) in enumerate(theta):
-        one = theta[n : n + 1]
         position = dict(zip(("j1", "j2", "j3", "j4", "j5"), (j1, 0.2 * j1 + 0.05, j3, j4, 0.35), strict=True))
         at = pin.integrate(model, pin.neutral(model), np.array([position[name] for name in list(model.names)[1:]]))
         pin.forwardKinematics(model, data, at)
@@ -185,7 +183,7 @@ def test_one_pose_is_where_pinocchio_has_it_and_as_it_is_among_many():
             joint = model.getJointId(name)
             place = data.oMi[model.parents[joint]].rotation @ model.jointPlacements[joint].rotation
             assert np.allclose(own, place, rtol=0.0, atol=1e-12)
-        assert np.allclose(arm.pose(one[0].tolist())[0], places[n], rtol=0.0, atol=1e-12)
+        assert np.allclose(arm.pose(theta[n].tolist())[0], places[n], rtol=0.0, atol=1e-12)
 
 
 PANDA, WHOLE = ARMS["panda"][0].read_text(encoding="utf-8"), ARMS["panda"][1]

@@ -29,9 +29,9 @@ from exo_gravity.hardware.urdf_arm import MOMENT_NAMES, TURN_NAMES, UrdfArm, arm
 GRID = ((-60, 0, 60), (15, 45, 75, 105, 135), (-30, 0, 30, 60, 90, 120), (0, 30, 60, 90, 120, 150))
 TURNS = 3  # of a joint's place: about its axis, and about two directions across it
 SUGGESTED = 600  # poses at random, from which one is suggested for another arm
+STEP = 10.0  # deg, of their angles
 FITTED = 60  # poses in which the moments of an arm are found from its torque
 DEPENDENT = 1e-6  # of the largest column: what is left of one that depends on others
-STEP = 10.0  # deg, of their angles
 LITTLE = 1e-6  # Nm per kg m: a joint that carries less carries nothing
 MOMENT_PARAMETERS = {"robot.first_moment": slice(JOINT_COUNT), "robot.off_axis": slice(JOINT_COUNT, None)}
 
@@ -170,16 +170,12 @@ class MomentModel:
         """Return what 1 kg in the joint of a link, and 1 kg m on it along x, y, z, add to the moments, (4, k)."""
         each = np.eye(self.count)[link]
         mass = self.moments_of(self.arm.with_wearer(each, 0.0 * each)) - self.moments
-        return np.vstack((mass, self._by_links[link]))
+        return np.vstack((mass, self._by_link(link)))
 
-    @cached_property
-    def _by_links(self) -> np.ndarray:
-        """What 1 kg m of each link along each axis of its frame adds to the moments, (n, 3, k)."""
-        added = np.zeros((self.count, 3, len(self.names)))
-        for k, (link, way) in enumerate(self.base):
-            added[link, :, k] = way
-        added[1, 1, 4] = added[2, 2, 5] = added[3, 2, 5] = 1.0  # along the axis of W, and twice along that of Z
-        return added
+    def _by_link(self, link: int) -> np.ndarray:
+        """Return what 1 kg m of a link along each axis of its frame adds to the moments, (3, k)."""
+        shown = ((0, 8, 4), (1, 4, 5), (2, 6, 5), (3, 7, 5))[link]  # 8: no moment, along the axis of joint 1
+        return np.eye(len(self.names) + 1)[list(shown), :-1]
 
     @cached_property
     def _on_last(self) -> np.ndarray:
@@ -285,11 +281,10 @@ class DescribedModel(MomentModel):
         rows = self.rows(poses, down).reshape(-1, len(self.base))
         return np.asarray(np.linalg.lstsq(rows, _needed(arm, poses, down).ravel(), rcond=None)[0])
 
-    @cached_property
-    def _by_links(self) -> np.ndarray:
-        ways = np.eye(3 * self.count).reshape(-1, self.count, 3)
-        added = [self.moments_of(self.arm.with_wearer_moments(way)) - self.moments for way in ways]
-        return np.reshape(added, (self.count, 3, -1))
+    def _by_link(self, link: int) -> np.ndarray:
+        """Return the same. Raises ParameterError if the link has no mass in the URDF."""
+        ways = [np.outer(np.eye(self.count)[link], way) for way in np.eye(3)]
+        return np.array([self.moments_of(self.arm.with_wearer_moments(way)) - self.moments for way in ways])
 
     def found(self, arm: UrdfArm, moments: np.ndarray, turn: np.ndarray) -> UrdfArm:
         """Return `arm` with these `moments` (k,) kg m and `turn` (n, 3) rad of the joints' axes, as a fit found them.

@@ -181,6 +181,8 @@ def test_the_derivatives_by_turns_of_the_joints_are_mujocos(count: int) -> None:
     model, random, step = DescribedModel(arm, True), np.random.default_rng(count), 1e-4
     poses, down = random.uniform(-2.0, 2.0, (10, count)), gravity_in_trunk(0.3, -0.2)
     shown = np.einsum("mnkat,a,k->tmn", model.turned(poses), down, model.moments)
+    beyond, without = (model.matrix(poses[0], (mass, 2.0)) for mass in (1.0, 0.0))  # m, from the last joint
+    assert np.linalg.eigvalsh(beyond - without).max() > 0.1
     moments = model.rows(poses, down).reshape(-1, len(model.names))
     for number, (turn, derivative) in enumerate(zip(arm.turns.reshape(-1, 3), shown, strict=True)):
         arms = [MujocoArm(turned(text, names[number // 3], sign * step * turn), names) for sign in (1.0, -1.0)]
