@@ -128,11 +128,11 @@ def test_a_change_during_another_begins_for_each_joint_where_that_joint_is():
     def needs(load, pose=1.0):
         return (pose * loads[load],) * 2
 
-    change.set_out("heavy", needs("heavy"), needs, needs("light"))
+    change.set_out(["heavy"], needs("heavy"), needs, needs("light"))
     while change.remainder[0] != 0.0 or not change.remainder[1]:
         torque = change.follow(0.01, (0.0, -1.0), needs, needs("light"))
     assert torque == (1.0, 3.0)  # joint 2 sinks: it keeps the heavy load
-    change.set_out("light", torque, needs, needs("middle"))
+    change.set_out(["light"], torque, needs, needs("middle"))
     for pose in (1.0, 0.1, -1.0):  # of what every load needs, after the joints have turned
         torque = change.follow(0.0, (1.0, 1.0), lambda load, pose=pose: needs(load, pose), needs("middle", pose))
         assert torque == pytest.approx((pose * 1.0, pose * 3.0))

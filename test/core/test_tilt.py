@@ -175,16 +175,16 @@ def test_a_tilt_that_creeps_in_small_jumps_faster_than_a_trunk_is_refused():
 
 
 @pytest.mark.parametrize("side", ["left", "right"])
-def test_a_tilt_faster_than_people_turn_overtakes_one_that_is_not_for_as_long_as_that_takes(side):
+def test_a_tilt_that_turns_overtakes_one_that_is_followed_at_once_for_as_long_as_that_takes(side):
     tilt, overtaken = TiltInput(side, TIMEOUT), []
-    for k in range(200):
-        angle = min(0.6, 1.5 * TILT.usual * 0.01 * k)
+    for k in range(1300):
+        angle = min(0.6, 1.5 * TILT.followed * 0.01 * k)
         tilt.set_gravity(10.0 + 0.01 * k, (0.0, -math.sin(angle), -math.cos(angle)))
         overtaken.append(tilt.overtaken.roll if tilt.overtaken else None)
     behind = [k for k, roll in enumerate(overtaken) if roll is not None]
-    expected = 2.0 * TILT.sudden / TILT.usual, (0.6 - TILT.sudden) / TILT.usual  # s
+    expected = 2.0 * TILT.ahead / TILT.followed, (0.6 - TILT.ahead) / TILT.followed  # s
     assert 0.01 * np.array((behind[0], behind[-1])) == pytest.approx(expected, abs=0.021)
-    assert [overtaken[k] for k in behind] == pytest.approx([TILT.usual * 0.01 * k for k in behind], abs=0.01)
+    assert [overtaken[k] for k in behind] == pytest.approx([TILT.followed * 0.01 * k for k in behind], abs=0.01)
 
 
 G = 9.80665

@@ -108,7 +108,8 @@ class Compensator:
         self._pending: Settings | None = None
         self._torque: Torque = (0.0,) * len(settings.max_effort)  # of the last step that had efforts, before the limit
         self._effort = self._torque  # of its rate,
-        self._last_time = -math.inf  # and its time
+        self._last = Reading(-math.inf, (), None)  # that it answers,
+        self._last_tilt = self.tilt.at(0.0)  # and its tilt
         self._change: GuidedChange[Load] = GuidedChange(len(settings.max_effort))
         self._drop_watch = DropWatch()
         self._fallback = ""  # why the exact law replaces the chosen one
@@ -149,13 +150,13 @@ class Compensator:
         self._follow_request(now)
         if self.settings.payload.mass and velocity:
             self._withdraw_lost_load(now, theta, velocity)
-        before = self._load_before()
+        before = self._loads_before()
         was_replaced = bool(self._fallback)
         gravity = self._law(now, theta)
         if not all(map(math.isfinite, gravity)):
             infinite = f"torque {list(gravity)} Nm from the law is not finite"
             return Compensation.withdrawn(Reason(Withdrawal.LAW_NOT_FINITE, infinite))
-        s, dt = self.settings, now - self._last_time
+        s, dt = self.settings, now - self._last.time
         torque = gravity
         if velocity:
             torque = tuple(map(operator.add, gravity, self.terms.torque(now, theta, velocity)))
@@ -169,10 +170,14 @@ class Compensator:
             change.stop()
             dt, self._effort = 0.0, torque
         elif before or bool(self._fallback) != was_replaced or (client and client.is_over):
-            change.set_out(before, self._torque, needs, torque)
+            start = self._torque
+            if len(before) > 1:  # the joints turn on while the trunk turns, and each keeps what it has on the way
+                here, there = (change.held(before[-1], each) for each in (needs, partial(self._torque_of, self._last)))
+                start = tuple([last + new - old for last, new, old in zip(self._torque, here, there, strict=True)])
+            change.set_out(before or (None,), start, needs, torque)
         if not change.is_over:
             torque = change.follow(dt, velocity, needs, torque)
-        self._torque, self._last_time = torque, now
+        self._torque, self._last, self._last_tilt = torque, at, self.tilt.at(now)
         most = s.max_effort_rate * min(dt, LONGEST_STEP)
         self._effort = tuple([limited(wanted, last, most) for wanted, last in zip(torque, self._effort, strict=True)])
         over = tuple([n for n, most in enumerate(s.max_effort) if not -most <= gravity[n] <= most])
@@ -182,7 +187,7 @@ class Compensator:
     def _asked_for(self, client: Client, at: Reading, torque: Torque) -> Torque:
         """Return `torque` (n,) in Nm with what `client` asks for, within CLIENT_EFFORT and what any load needs."""
         tilt, velocity = self.tilt.at(at.time), at.velocity or ()
-        asked = client.torque(at.time - self._last_time, at.theta, velocity, tilt, torque)
+        asked = client.torque(at.time - self._last.time, at.theta, velocity, tilt, torque)
         if not self._most_asked:  # in the pose in which it began
             heaviest = MAX_PAYLOAD * self.settings.arm.gravity
             levers = self.settings.unit_load.torque(at.theta, tilt)
@@ -202,14 +207,18 @@ class Compensator:
         torques = [self.settings.exact.torque(theta, axis) for axis in AXES]
         return max(math.hypot(*components) for components in zip(*torques, strict=True))
 
-    def _load_before(self) -> Load | None:
-        """Return what was carried until now if the settings or, suddenly, the tilt have changed; use new settings."""
+    def _loads_before(self) -> Sequence[Load]:
+        """Return what may have been carried until now if the settings or the tilt have changed.
+
+        New settings are used from now on.
+        """
         overtaken = self.tilt.overtaken if self.settings.use_imu else None
-        before = Load(self.settings, self.terms.in_force, overtaken)
+        tilts = (overtaken, self._last_tilt) if overtaken else (None,)
+        loads = [Load(self.settings, self.terms.in_force, tilt) for tilt in tilts]
         if self._pending:
             self._use(self._pending)
-            return before
-        return before if overtaken and not self._active_client else None
+            return loads
+        return loads if overtaken and not self._active_client else ()
 
     def _use(self, settings: Settings) -> None:
         if settings.law != self.settings.law:
@@ -229,7 +238,7 @@ class Compensator:
             if sum(map(operator.mul, per_mass, self.applied)) < DROP.least_carried * needed:
                 return
         speed = sum(map(operator.mul, per_mass, velocity))
-        if self._drop_watch.step(now - self._last_time, speed, s.payload.mass):
+        if self._drop_watch.step(now - self._last.time, speed, s.payload.mass):
             self.dropped = s.payload.mass
             self._pending = replace(self._pending or s, payload=s.payload._replace(mass=0.0))
 

@@ -62,8 +62,8 @@ class GuidedChange(GuidedMotion, Generic[Load]):
     """The way of each of `count` joints to the new load from one before it.
 
     A change may follow another before that is done. What a joint has then lies between two loads, so it is on the way
-    to the new one from at least one of them, and follows the arm into other poses with both. Of two, it takes the
-    longer way, which leaves most to go back. A constant, the offset, is only what no load explains: the torque of a
+    to the new one from at least one of them, and follows the arm into other poses with both. Of several, it takes the
+    longest way, which leaves most to go back. A constant, the offset, is only what no load explains: the torque of a
     weighing, or of a law that does not apply here.
 
     remainder: (n,) Nm that the torque still has to go.
@@ -81,12 +81,12 @@ class GuidedChange(GuidedMotion, Generic[Load]):
         """Whether the motors are to damp the joints meanwhile."""
         return not self.is_over and self._largest > LARGE
 
-    def set_out(self, carried: Load | None, torque: Torque, needs: Needs[Load], after: Torque) -> None:
+    def set_out(self, carried: Sequence[Load | None], torque: Torque, needs: Needs[Load], after: Torque) -> None:
         """Begin at the present `torque` the way to `after`, both (n,) Nm in this pose.
 
-        carried: what was the new load until now; None where it explains nothing.
+        carried: what may have been the new load until now; None where it explains nothing.
         """
-        starts = [([carried] * len(after), self._zeros)]
+        starts = [([load] * len(after), self._zeros) for load in carried]
         if not self.is_over:
             starts.append((self._origins, self._offset))
         ways = [zip(*start, _torques(*start, needs, after), strict=True) for start in starts]
@@ -98,6 +98,12 @@ class GuidedChange(GuidedMotion, Generic[Load]):
         origins, self._offset, shares = zip(*joints, strict=True)
         self._origins = list(origins)
         self.begin(shares)
+
+    def held(self, load: Load, needs: Needs[Load]) -> Torque:
+        """Return the torque (n,) in Nm of the present shares in the pose of `needs`, on the way to `load`."""
+        after = needs(load)
+        before = _torques(self._origins, self._offset, needs, after)
+        return tuple([new + share * (old - new) for share, old, new in zip(self.shares, before, after, strict=True)])
 
     def follow(self, dt: float, velocity: Sequence[float] | None, needs: Needs[Load], after: Torque) -> Torque:
         """Return the torque (n,) in Nm after `dt` s more.

@@ -50,7 +50,7 @@ class MotionLimits:
     patience: float = 0.012  #: s of the full load
     memory: float = 1.0  #: s, time constant
     near: float = 0.97  #: cosine of 14 degrees: tilts as near as that count as one
-    guided: float = 5.0  #: s for which the torque may still be on its way to a tilt that came suddenly
+    guided: float = 5.0  #: s for which the torque may still be on its way to a tilt before
 
 
 @dataclass(frozen=True)
@@ -89,7 +89,7 @@ class MotionMonitor:
     def follow(self, tilt: Tilt, overtaken: Tilt | None) -> None:
         """Take the tilt of the trunk; upright before the first one.
 
-        overtaken: from which the torque is guided, if the trunk has turned suddenly (`TiltInput.overtaken`).
+        overtaken: from which the torque is guided, if the trunk has turned (`TiltInput.overtaken`).
         """
         gravity, self.trunk_tilt = self._down(tilt), tilt.axis_angle
         if overtaken or not math.dist(gravity, self._gravity) <= MOTION.still:
