@@ -14,6 +14,7 @@ from exo_gravity.core.arm.interface import NO_LOAD, Payload
 from exo_gravity.core.arm.springs import Springs
 from exo_gravity.core.arm.tilt import Tilt
 from exo_gravity.core.arm.wearer import TISSUE_REACH, Wearer
+from exo_gravity.core.compensation.compensator import Compensator
 from exo_gravity.core.compensation.guidance import CommandFade, GuidedChange
 from exo_gravity.core.compensation.support import NAME, REQUEST
 from exo_gravity.core.compensation.terms.catalogue import Spring
@@ -136,6 +137,21 @@ def test_a_change_during_another_begins_for_each_joint_where_that_joint_is():
     for pose in (1.0, 0.1, -1.0):  # of what every load needs, after the joints have turned
         torque = change.follow(0.0, (1.0, 1.0), lambda load, pose=pose: needs(load, pose), needs("middle", pose))
         assert torque == pytest.approx((pose * 1.0, pose * 3.0))
+
+
+def test_while_the_trunk_turns_and_the_joints_move_the_torque_is_one_that_a_tilt_on_the_way_needs():
+    """A constant that made up for the rest was wrong in the next pose: relaxed wearers who bowed were let down."""
+    compensator = Compensator(settings_with(mode="zero_g", use_imu=True))
+    tilts = [Tilt.of("left", 0.0, angle) for angle in np.linspace(-0.6, 0.6, 9)]
+    for time in np.arange(0.0, 8.0, PERIOD):
+        turn = 0.6 * math.sin(2.0 * time)
+        compensator.tilt.set_gravity(time, (0.0, -math.sin(turn), -math.cos(turn)))
+        theta = np.array(THETA) + 0.7 * math.sin(1.7 * time)
+        velocity = (0.7 * 1.7 * math.cos(1.7 * time),) * 4
+        effort = compensator.step(time, theta.tolist(), velocity).effort
+        needed = np.array([compensator.settings.exact.torque(theta.tolist(), tilt) for tilt in tilts])
+        assert np.all(effort > needed.min(axis=0) - 0.3)
+        assert np.all(effort < needed.max(axis=0) + 0.3)
 
 
 def test_where_the_velocity_is_not_known_a_change_takes_longer_and_settings_that_change_no_torque_begin_none():
