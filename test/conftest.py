@@ -72,7 +72,7 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
 
 
 def pytest_collection_finish() -> None:
-    """Leave what was collected to no later garbage collection: each would go through it, a third of the time."""
+    """Leave what was collected to no later garbage collection: each would go through it, a fifth of the time."""
     gc.freeze()
 
 

@@ -79,14 +79,14 @@ CLAMPED, REPLIES_LOST, LOAD_LOST = Bound(1.9, math.inf), Bound(1.5, math.inf), B
 # 2.1 Nm that held 1 kg accelerate a bare forearm of 0.006 kg m^2 by 3.5 rad/s a cycle, and the second cycle answers.
 LOST_AT_100_HZ = Bound(7.0, math.inf)
 TILT_JUMPED = Bound(1.0, math.inf)
-TILT_CREPT = Bound(2.9, math.inf)  # slowly; or the arm is moved once it is no longer new
+TILT_CREPT = Bound(2.9, math.inf)  # no faster than people turn; or the arm is moved once it is no longer new
 # A motor that no command reaches keeps its torque: only its own time-out ends what a lost load, or a trunk or a hand
 # that moves, leaves (invariant 11).
 UNREACHED, MOVED_UNREACHED = ("commands_lost", "bus_silent"), Bound(math.inf, math.inf)
 # While torques are clamped or late, what carries the arm belongs to a tilt that the trunk has left. The arm then lags
 # behind the trunk, which falls at 3.3 rad/s and more.
 LATE, TURNED_AHEAD = ("efforts_late", "imu_silent", "imu_frozen"), Bound(2.9, math.inf, turning=True)
-SLOWLY = 1.0  # s, from which on a wrong tilt turns slowly
+SLOWLY = 1.0  # s, from which on a wrong tilt turns no faster than people do
 
 
 class Kind(NamedTuple):

@@ -72,21 +72,25 @@ def test_an_empty_arm_whose_load_is_not_as_believed_when_it_is_carried_again_mov
     assert 0.1 < fastest_driven(arm) < SAFE_SPEED
 
 
-LOOSE = [(BARE, 30.0, 0.2), (BARE, 30.0, 2.5), ({}, 30.0, 2.5), ({}, 30.0, 0.2), ({}, 60.0, 0.2)]  # degrees, s
+LOOSE = [(BARE, 30.0), ({}, 30.0), ({}, 60.0)]
 
 
-@pytest.mark.parametrize(("given", "roll", "over"), quick(LOOSE[:2], LOOSE))
-def test_an_imu_that_comes_loose_drives_the_arm_slowly(given, roll, over):
+@pytest.mark.parametrize(("given", "roll"), quick(LOOSE[:1], LOOSE), ids=["empty, 30 degrees", "worn, 30", "worn, 60"])
+def test_an_imu_that_comes_loose_drives_the_arm_slowly(given, roll):
     arm = guided_arm(**given)
-    ACTS["imu_wrong"](arm, 0.0, math.radians(roll), over)
-    arm.run(4.0 + over)
+    ACTS["imu_wrong"](arm, 0.0, math.radians(roll), 0.2)
+    arm.run(4.2)
     assert 0.1 < fastest_driven(arm) < SAFE_SPEED
 
 
-def test_a_trunk_that_falls_takes_the_arm_along():
-    arm = guided_arm()
-    arm.act({"bow": 1.4, "over": 0.8})
-    arm.run(5.0)
+def test_a_trunk_that_falls_takes_the_arm_along_and_one_that_bows_is_not_felt():
+    arm, damped = guided_arm(), []
+    for angle, duration in ((0.5, 1.0), (0.0, 1.0), (1.4, 0.8)):
+        arm.forget()
+        arm.act({"bow": angle, "over": duration})
+        damped.append(arm.run_until(lambda: arm.direct.answer.damped, 4.0))
+    assert damped == [False, False, True]
+    arm.run(3.0)
     assert arm.state is State.ACTIVE, arm.safety.fault
     assert arm.fastest < 4.0  # where the torque follows at once it is 7.7
 

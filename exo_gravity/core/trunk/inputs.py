@@ -41,10 +41,10 @@ class TiltLimits:
     #: rad, by which a tilt may deviate from a reference direction that follows the tilts no faster than `speed`. Noise
     #: stays within it; neither a jump nor many small ones in a row do
     jump: float = 0.1
-    #: rad/s, faster than which a turn is guided. A trunk that turns and an IMU that slips look alike: the torque
-    #: follows both no faster than the joints stay calm. Slower slips drive an arm at 2.4 rad/s; this costs a wearer
-    #: who leans and reaches 0.3 Nm RMS at most
-    followed: float = 0.05
+    #: rad/s, faster than which a turn is guided: faster than a bow of 30 degrees in a second. A fall is, and an IMU
+    #: that comes loose. With 0.05 one that slips by 30 degrees at 0.1 to 0.74 rad/s drives an arm at 1.1 rad/s, not
+    #: at 4.1, but a bow past 90 degrees drives it at 1.1, which is more than the bound
+    followed: float = 0.75
     ahead: float = 0.05  #: rad, once the tilt is so far ahead of one that turns no faster
     #: s by which a stamp may be ahead of our clock: /clock comes in steps, hosts differ by ms. A clock that goes fast
     #: gets further ahead, which shows only that: no sample arrives before it was taken. So a lead is added to all ages,
