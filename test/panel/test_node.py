@@ -111,12 +111,12 @@ class PlayedArm:
 
     def _publish(self) -> None:
         self._states.publish(JointState(name=NAMES, position=[0.1] * 4, velocity=[0.0] * 4, effort=[1.0] * 4))
-        told = {"state": "disabled", "fault": "none", "control held by": self.holder}
+        content = {"state": "disabled", "fault": "none", "control held by": self.holder}
         # The panel decides by keys alone: this is no sentence of ours.
         status = DiagnosticStatus(
             name="right/can_bridge",
             message="zqx vw: kfj",
-            values=[KeyValue(key=key, value=value) for key, value in told.items()],
+            values=[KeyValue(key=key, value=value) for key, value in content.items()],
         )
         self._statuses.publish(DiagnosticArray(status=[status]))
 

@@ -247,8 +247,9 @@ class DescribedModel(MomentModel):
 
     def __init__(self, arm: UrdfArm, uses_imu: bool, rotors: Sequence[float] = ()) -> None:
         if not arm.moves_alone:
-            listed = list(arm.names)
-            raise ParameterError("joint_names", listed, "all joints that move the arm's links, for a calibration")
+            raise ParameterError(
+                "joint_names", list(arm.names), "all joints that move the arm's links, for a calibration"
+            )
         self.directions, self.turns, self.moved_by = arm.directions, arm.turns, arm.moved_by
         self.base = self._base_of(arm)
         numbers = [n for n, _ in self.base]
@@ -313,8 +314,7 @@ class DescribedModel(MomentModel):
     def in_file(self, moments: np.ndarray, turn: np.ndarray) -> dict[str, np.ndarray]:
         """Return the same: by what the first moments and places of the joints differ from the URDF's."""
         new = self.found(self.arm, moments, turn)
-        values = (*new.change.T, *new.turn.T)
-        return dict(zip((*MOMENT_NAMES, *TURN_NAMES), values, strict=True))
+        return dict(zip((*MOMENT_NAMES, *TURN_NAMES), (*new.change.T, *new.turn.T), strict=True))
 
     def worn(self, moments: np.ndarray) -> Arm:
         """Return the arm with a wearer who adds `moments` (k,) kg m."""
