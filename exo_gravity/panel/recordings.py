@@ -230,6 +230,15 @@ class Recordings:
 
     def past(self) -> dict[str, list[Any]]:
         """Return the codes of all subjects, and the recordings and trials, the newest first."""
+        found = self._found()
+        kept = {path.parent.name for path in self._output.glob(f"*/{WEARER}")}
+        return {
+            "subjects": sorted(kept | {entry["subject"] for entry, _ in found} - {""}),
+            "past": [{**entry, **self._content(path)} for entry, path in found[:MOST_LISTED]],
+        }
+
+    def _found(self) -> list[tuple[dict[str, Any], Path]]:
+        """Return what the path of each recording and trial says, and the path, the newest first."""
         found: list[tuple[dict[str, Any], Path]] = []
         for path in (*self._output.glob("*_*/"), *self._output.glob("*/*-*-*/*_*/")):
             if (match := FOLDER_NAME.fullmatch(path.name)) and (self._key(path, REPORT) or self._key(path, "bag")):
@@ -237,12 +246,7 @@ class Recordings:
                 *subject, _ = path.relative_to(self._output).parts
                 when = f"{year}-{month}-{day} {hour}:{minute}:{second}"
                 found.append(({"subject": "".join(subject[:1]), "trial": name, "when": when}, path))
-        found.sort(key=lambda each: each[0]["when"], reverse=True)
-        kept = {path.parent.name for path in self._output.glob(f"*/{WEARER}")}
-        return {
-            "subjects": sorted(kept | {entry["subject"] for entry, _ in found} - {""}),
-            "past": [{**entry, **self._content(path)} for entry, path in found[:MOST_LISTED]],
-        }
+        return sorted(found, key=lambda each: each[0]["when"], reverse=True)
 
     def _content(self, path: Path) -> dict[str, Any]:
         """Return what the folder `path` of a trial has: what its report says, and the names of report and recording."""
@@ -256,12 +260,13 @@ class Recordings:
         if not {*self._device.states().values()} <= {State.DISABLED.value, State.FAULT.value}:
             # Such a program may load the computer that carries them.
             return "a program is started while every arm is off"
-        command, listed = programs().get(str(program)), [entry["folder"] for entry in self.past()["past"]]
-        path = self.file(name, FILES["recording"]) if name and name in listed else None
+        command, listed = programs().get(str(program)), [self._key(path, "bag") for _, path in self._found()]
+        path = self.file(name, FILES["recording"]) if name and name in listed[:MOST_LISTED] else None
         if not (command and path):
             raise ParameterError("name, program", [name, program], "a recording of the list and an installed program")
-        words = ("setsid", "--fork", *command, str(path))
-        starter = await asyncio.create_subprocess_exec(*words, stdin=DEVNULL, stdout=DEVNULL, stderr=DEVNULL)
+        starter = await asyncio.create_subprocess_exec(
+            "setsid", "--fork", *command, str(path), stdin=DEVNULL, stdout=DEVNULL, stderr=DEVNULL
+        )
         return "" if await starter.wait() == 0 else f"{program} could not be started"
 
     def file(self, name: str, pattern: str) -> Path | None:

@@ -209,7 +209,7 @@ def test_a_listed_recording_is_opened_in_a_program_on_this_computer_by_its_opera
     for place in ("ros/lib/plotjuggler/plotjuggler", "bin/foxglove-studio"):
         (viewer := tmp_path / place).parent.mkdir(parents=True)
         viewer.write_text(
-            f'#!/bin/sh\nprintf "%s\\n" "${{0##*/}}" "$@" > {tmp_path}/told_\nmv {tmp_path}/told_ {tmp_path}/told\n'
+            f'#!/bin/sh\nprintf "%s\\n" "${{0##*/}}" "$@" > {tmp_path}/part\nmv {tmp_path}/part {tmp_path}/started\n'
         )
         viewer.chmod(0o755)
     for variable, value in {**ENVIRONMENT, **environment}.items():
@@ -233,12 +233,12 @@ def test_a_listed_recording_is_opened_in_a_program_on_this_computer_by_its_opera
     sessions, answer = asyncio.run(asked())
     assert (sessions.json()["programs"], answer.status_code) == (offered, status), answer.text
     if status == 200:
-        wait_until((tmp_path / "told").exists)
-        assert (tmp_path / "told").read_text().splitlines() == [
+        wait_until((tmp_path / "started").exists)
+        assert (tmp_path / "started").read_text().splitlines() == [
             *(["foxglove-studio"] if changes else ["plotjuggler", "-d"]),
             f"{tmp_path}/out/{OPENED}/bag/bag_0.mcap",
         ]
-    assert (tmp_path / "told").exists() == (status == 200)
+    assert (tmp_path / "started").exists() == (status == 200)
 
 
 BODIES = [
