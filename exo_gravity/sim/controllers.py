@@ -49,7 +49,7 @@ class DirectController(SampleController):
     def __init__(self, compensator: Compensator, limits: Limits) -> None:
         super().__init__(limits)
         self.compensator = compensator
-        self.answer = Compensation.withdrawn(NO_REASON)  #: the compensator's last one
+        self.answer = Compensation(None, NO_REASON)  #: the compensator's last one
         self.was_clamped = False  #: whether one of them was, so far
 
     def _efforts_for(self, now: float, samples: Sequence[JointSample]) -> Efforts:

@@ -60,24 +60,20 @@ class Compensation(NamedTuple):
 
     effort: Torque | None  #: (n,) Nm; None for the given `reason`
     reason: Reason  #: why there are no efforts; false if there are
-    clamped: tuple[int, ...]  #: indices of the joints whose gravity torque exceeds `max_effort`
-    fallback: str  #: why the exact law replaced the chosen one, or ''
-    remainder: Torque  #: (n,) Nm by which a change of load is not done yet; () if none is under way
-    damped: bool  #: whether the motors are to damp the joints meanwhile
-    held: str  #: why the last tilt is held on, and the bound of the error in Nm; or ''
-
-    @classmethod
-    def withdrawn(cls, reason: Reason) -> "Compensation":
-        """Return the answer without efforts."""
-        return cls(None, reason, clamped=(), fallback="", remainder=(), damped=False, held="")
+    clamped: tuple[int, ...] = ()  #: indices of the joints whose gravity torque exceeds `max_effort`
+    fallback: str = ""  #: why the exact law replaced the chosen one
+    remainder: Torque = ()  #: (n,) Nm by which a change of load is not done yet; () if none is under way
+    damped: bool = False  #: whether the motors are to damp the joints meanwhile
+    held: str = ""  #: why the last tilt is held on, and the bound of the error in Nm
 
 
 class Reading(NamedTuple):
-    """The joints at one moment."""
+    """The joints and the trunk at one moment."""
 
     time: float  #: s on a monotonic clock
     theta: Sequence[float]  #: (n,) rad
     velocity: Sequence[float] | None  #: (n,) rad/s, None if not known
+    tilt: Tilt
 
 
 class Load(NamedTuple):
@@ -108,8 +104,7 @@ class Compensator:
         self._pending: Settings | None = None
         self._torque: Torque = (0.0,) * len(settings.max_effort)  # of the last step that had efforts, before the limit
         self._effort = self._torque  # of its rate,
-        self._last = Reading(-math.inf, (), None)  # that it answers,
-        self._last_tilt = self.tilt.at(0.0)  # and its tilt
+        self._last = Reading(-math.inf, (), None, self.tilt.at(0.0))  # that it answers
         self._change: GuidedChange[Load] = GuidedChange(len(settings.max_effort))
         self._drop_watch = DropWatch()
         self._fallback = ""  # why the exact law replaces the chosen one
@@ -140,27 +135,28 @@ class Compensator:
         if len(theta) != len(self._effort) or not all(-MAX_ANGLE <= angle <= MAX_ANGLE for angle in theta):
             expected = f"{len(self._effort)} numbers within {MAX_ANGLE:g} rad"
             impossible = f"joint angles {list(theta)} are not {expected}"
-            return Compensation.withdrawn(Reason(Withdrawal.IMPOSSIBLE_ANGLES, impossible))
-        late, held = self.tilt.problem(now) if self.settings.use_imu else NO_REASON, ""
+            return Compensation(None, Reason(Withdrawal.IMPOSSIBLE_ANGLES, impossible))
+        late, late_tilt = self.tilt.problem(now) if self.settings.use_imu else NO_REASON, ""
         if late:
             turn = self.tilt.unknown_turn(now)
             if not turn <= TILT.turn:
-                return Compensation.withdrawn(late)
-            held = f"{late}: held on, torque off by at most {turn * self._largest_torque(theta):.2f} Nm"
+                return Compensation(None, late)
+            late_tilt = f"{late}: held on, torque off by at most {turn * self._largest_torque(theta):.2f} Nm"
         self._follow_request(now)
+        at = Reading(now, theta, velocity, self.tilt.at(now))
         if self.settings.payload.mass and velocity:
-            self._withdraw_lost_load(now, theta, velocity)
+            self._withdraw_lost_load(at, velocity)
         before = self._loads_before()
         was_replaced = bool(self._fallback)
-        gravity = self._law(now, theta)
+        gravity = self._law(at)
         if not all(map(math.isfinite, gravity)):
             infinite = f"torque {list(gravity)} Nm from the law is not finite"
-            return Compensation.withdrawn(Reason(Withdrawal.LAW_NOT_FINITE, infinite))
+            return Compensation(None, Reason(Withdrawal.LAW_NOT_FINITE, infinite))
         s, dt = self.settings, now - self._last.time
         torque = gravity
         if velocity:
             torque = tuple(map(operator.add, gravity, self.terms.torque(now, theta, velocity)))
-        at, client = Reading(now, theta, velocity), self._active_client if velocity else None
+        client = self._active_client if velocity else None
         if client:
             torque = self._asked_for(client, at, torque)
         torque = clamped(torque, s.max_effort)
@@ -170,27 +166,23 @@ class Compensator:
             change.stop()
             dt, self._effort = 0.0, torque
         elif before or bool(self._fallback) != was_replaced or (client and client.is_over):
-            start = self._torque
-            if len(before) > 1:  # the joints turn on while the trunk turns, and each keeps what it has on the way
-                here, there = (change.held(before[-1], each) for each in (needs, partial(self._torque_of, self._last)))
-                start = tuple([last + new - old for last, new, old in zip(self._torque, here, there, strict=True)])
-            change.set_out(before or (None,), start, needs, torque)
+            held = self._held_here(before[-1], at) if before and before[-1].tilt else self._torque
+            change.set_out(before or (None,), held, needs, torque)
         if not change.is_over:
             torque = change.follow(dt, velocity, needs, torque)
-        self._torque, self._last, self._last_tilt = torque, at, self.tilt.at(now)
+        self._torque, self._last = torque, at
         most = s.max_effort_rate * min(dt, LONGEST_STEP)
         self._effort = tuple([limited(wanted, last, most) for wanted, last in zip(torque, self._effort, strict=True)])
         over = tuple([n for n, most in enumerate(s.max_effort) if not -most <= gravity[n] <= most])
         remainder = () if change.is_over else change.remainder
-        return Compensation(self._effort, NO_REASON, over, self._fallback, remainder, change.is_large, held)
+        return Compensation(self._effort, NO_REASON, over, self._fallback, remainder, change.is_large, late_tilt)
 
     def _asked_for(self, client: Client, at: Reading, torque: Torque) -> Torque:
         """Return `torque` (n,) in Nm with what `client` asks for, within CLIENT_EFFORT and what any load needs."""
-        tilt, velocity = self.tilt.at(at.time), at.velocity or ()
-        asked = client.torque(at.time - self._last.time, at.theta, velocity, tilt, torque)
+        asked = client.torque(at.time - self._last.time, at.theta, at.velocity or (), at.tilt, torque)
         if not self._most_asked:  # in the pose in which it began
             heaviest = MAX_PAYLOAD * self.settings.arm.gravity
-            levers = self.settings.unit_load.torque(at.theta, tilt)
+            levers = self.settings.unit_load.torque(at.theta, at.tilt)
             self._most_asked = [CLIENT_EFFORT + heaviest * abs(lever) for lever in levers]
         return tuple(map(operator.add, torque, clamped(map(operator.sub, asked, torque), self._most_asked)))
 
@@ -213,12 +205,21 @@ class Compensator:
         New settings are used from now on.
         """
         overtaken = self.tilt.overtaken if self.settings.use_imu else None
-        tilts = (overtaken, self._last_tilt) if overtaken else (None,)
+        tilts = (overtaken, self._last.tilt) if overtaken else (None,)
         loads = [Load(self.settings, self.terms.in_force, tilt) for tilt in tilts]
         if self._pending:
             self._use(self._pending)
             return loads
         return loads if overtaken and not self._active_client else ()
+
+    def _held_here(self, load: Load, at: Reading) -> Torque:
+        """Return the last torque (n,) in Nm as it is in the present pose: joints turn on while the trunk turns.
+
+        load: carried then. Each joint keeps its share of the way to it.
+        """
+        poses = at, self._last._replace(tilt=self.tilt.at(self._last.time))  # by the newest tilt, both
+        here, there = (self._change.held(load, partial(self._torque_of, pose)) for pose in poses)
+        return tuple([torque + new - old for torque, new, old in zip(self._torque, here, there, strict=True)])
 
     def _use(self, settings: Settings) -> None:
         if settings.law != self.settings.law:
@@ -229,38 +230,38 @@ class Compensator:
         self.tilt.timeout = settings.tilt_timeout
         self.terms.apply(settings.terms, settings.moving)
 
-    def _withdraw_lost_load(self, now: float, theta: Sequence[float], velocity: Sequence[float]) -> None:
+    def _withdraw_lost_load(self, at: Reading, velocity: Sequence[float]) -> None:
         """Carry a load that has left the hand no longer."""
         s = self.settings
-        per_mass = s.unit_load.torque(theta, self.tilt.at(now))  # m that each joint lifts it, per rad
+        per_mass = s.unit_load.torque(at.theta, at.tilt)  # m that each joint lifts it, per rad
         if self.applied:  # motors that do not carry the load cannot throw the arm
             needed = s.payload.mass * s.arm.gravity * sum(height * height for height in per_mass)
             if sum(map(operator.mul, per_mass, self.applied)) < DROP.least_carried * needed:
                 return
         speed = sum(map(operator.mul, per_mass, velocity))
-        if self._drop_watch.step(now - self._last.time, speed, s.payload.mass):
+        if self._drop_watch.step(at.time - self._last.time, speed, s.payload.mass):
             self.dropped = s.payload.mass
             self._pending = replace(self._pending or s, payload=s.payload._replace(mass=0.0))
 
-    def _law(self, now: float, theta: Sequence[float]) -> Torque:
+    def _law(self, at: Reading) -> Torque:
         """Return the torque of the chosen law, or of the exact law while the chosen one does not apply."""
-        torque, reason = self._gravity(self.settings, now, theta, exact=now < self._fallback_until)
+        torque, reason = self._gravity(self.settings, at, exact=at.time < self._fallback_until)
         if reason:
-            self._fallback, self._fallback_until = reason, now + FALLBACK_TIME
-        elif now >= self._fallback_until:
+            self._fallback, self._fallback_until = reason, at.time + FALLBACK_TIME
+        elif at.time >= self._fallback_until:
             self._fallback = ""
         return torque
 
-    def _gravity(self, s: Settings, now: float, theta: Sequence[float], exact: bool = False) -> tuple[Torque, str]:
+    def _gravity(self, s: Settings, at: Reading, exact: bool = False) -> tuple[Torque, str]:
         """Return the torque (n,) in Nm by the law of the settings, or by the exact law and why theirs does not apply.
 
         The tilt is that of what the trunk feels as gravity. exact: by the exact law in any case.
         """
-        felt = self.motion.at(now, s.shoulder_from_imu) if s.inertial and s.use_imu else None
+        felt = self.motion.at(at.time, s.shoulder_from_imu) if s.inertial and s.use_imu else None
         if not felt:
-            return s.torque(theta, self.tilt.at(now), exact)
-        torque, reason = s.torque(theta, Tilt.of_felt(s.side, felt.gravity, STANDARD_GRAVITY), exact)
-        turning = s.arm.turning_torque(s.side, theta, felt.angular_acceleration)
+            return s.torque(at.theta, at.tilt, exact)
+        torque, reason = s.torque(at.theta, Tilt.of_felt(s.side, felt.gravity, STANDARD_GRAVITY), exact)
+        turning = s.arm.turning_torque(s.side, at.theta, felt.angular_acceleration)
         return tuple(map(operator.add, torque, turning)), reason
 
     @property
@@ -272,7 +273,7 @@ class Compensator:
         if load.tilt:
             torque, _ = load.settings.torque(reading.theta, load.tilt, exact=False)
         else:
-            torque, _ = self._gravity(load.settings, reading.time, reading.theta)
+            torque, _ = self._gravity(load.settings, reading)
         if reading.velocity:
             torque = tuple(map(operator.add, torque, self.terms.torque_of(load.terms)))
         return clamped(torque, load.settings.max_effort)

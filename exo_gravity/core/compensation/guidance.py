@@ -100,10 +100,9 @@ class GuidedChange(GuidedMotion, Generic[Load]):
         self.begin(shares)
 
     def held(self, load: Load, needs: Needs[Load]) -> Torque:
-        """Return the torque (n,) in Nm of the present shares in the pose of `needs`, on the way to `load`."""
+        """Return the torque (n,) in Nm at the present shares of the way to `load`, in the pose of `needs`."""
         after = needs(load)
-        before = _torques(self._origins, self._offset, needs, after)
-        return tuple([new + share * (old - new) for share, old, new in zip(self.shares, before, after, strict=True)])
+        return self.between(_torques(self._origins, self._offset, needs, after), after)
 
     def follow(self, dt: float, velocity: Sequence[float] | None, needs: Needs[Load], after: Torque) -> Torque:
         """Return the torque (n,) in Nm after `dt` s more.

@@ -84,6 +84,10 @@ class GuidedMotion:
             max(0.0, min(1.0, share - dt * pace(speed, new - old))) for share, speed, old, new in columns
         ])  # fmt: skip
         self._calm = 0.0 if any(self.shares) else self._calm + dt
+        return self.between(before, wanted)
+
+    def between(self, before: Sequence[float], wanted: Sequence[float]) -> tuple[float, ...]:
+        """Return the torque (n,) in Nm at the present shares; before, wanted: as in `step`."""
         return tuple([new + share * (old - new) for share, old, new in zip(self.shares, before, wanted, strict=True)])
 
 

@@ -41,9 +41,9 @@ class TiltLimits:
     #: rad, by which a tilt may deviate from a reference direction that follows the tilts no faster than `speed`. Noise
     #: stays within it; neither a jump nor many small ones in a row do
     jump: float = 0.1
-    #: rad/s, faster than which a turn is guided: faster than a bow of 30 degrees in a second. A fall is, and an IMU
-    #: that comes loose. With 0.05 one that slips by 30 degrees at 0.1 to 0.74 rad/s drives an arm at 1.1 rad/s, not
-    #: at 4.1, but a bow past 90 degrees drives it at 1.1, which is more than the bound
+    #: rad/s; the torque follows a faster turn as a guided motion: a fall, or an IMU that comes loose. A bow of 30
+    #: degrees in a second is slower. With 0.05 an IMU that slips by 30 degrees at 0.1 to 0.74 rad/s drives an arm at
+    #: 1.1 rad/s, not at 4.1; but a bow past 90 degrees drives it at 1.1, too, which is beyond the bound
     followed: float = 0.75
     ahead: float = 0.05  #: rad, once the tilt is so far ahead of one that turns no faster
     #: s by which a stamp may be ahead of our clock: /clock comes in steps, hosts differ by ms. A clock that goes fast
@@ -89,7 +89,7 @@ class TiltInput:
         self._arrival = -math.inf
         self._lead = 0.0  # s, of the stamps
         self._reference = self._tilt.direction  # (3,), follows the tilts no faster than a trunk tilts
-        self._behind = self._reference  # (3,), the same no faster than a turn that is not guided
+        self._behind = self._reference  # (3,), follows them no faster than TILT.followed
         #: the tilt of a trunk that turns no faster, while the newest one is far ahead of it; else None
         self.overtaken: Tilt | None = None
         self._vector_arrival = -math.inf  # of a gravity vector, accepted or not
@@ -177,8 +177,7 @@ class TiltInput:
             raise ParameterError("trunk tilt", [tilt.pitch, tilt.roll], expected)
         self._reference = reference
         self._behind, ahead = _followed(self._behind, tilt.direction, TILT.followed * elapsed)
-        is_guided = ahead > TILT.ahead
-        self.overtaken = Tilt.of_gravity(self._side, self._in_trunk(self._behind)) if is_guided else None
+        self.overtaken = Tilt.of_gravity(self._side, self._in_trunk(self._behind)) if ahead > TILT.ahead else None
         self._tilt, self._angular_velocity = tilt, angular_velocity
         self._time, self._arrival, self._lead, self._refusal = measured, now, lead, ""
         if now - measured <= self.timeout:

@@ -77,7 +77,7 @@ class CompensatorNode(Node):
         is_called = context is not None  # by can_bridge: then the topic is polled in `answer`
         self._interface = self._open_interface(values, is_called)
         self._diagnostics = Diagnostics(self)
-        self._answer = Compensation.withdrawn(NO_REASON)
+        self._answer = Compensation(None, NO_REASON)
         self._changes: deque[Compensation] = deque(maxlen=MAX_CHANGES)
         self._last_answer = -math.inf
         self._answers = self._rides = 0
@@ -162,16 +162,16 @@ class CompensatorNode(Node):
             if self._urdf:
                 self._urdf.follow(message.name, message.position)
             if self._interface.problem:  # no step: there is no torque to change
-                answer = Compensation.withdrawn(Reason(Withdrawal.OUTPUT_FAULT, self._interface.problem))
+                answer = Compensation(None, Reason(Withdrawal.OUTPUT_FAULT, self._interface.problem))
             else:
                 with self._lock:
                     self._control.applied = message.effort if message.name == self._names else None
                     answer = self._control.step(now, theta, velocity)
         except ParameterError as error:
             refused = self._refused(self._interface.topic, error)
-            answer = Compensation.withdrawn(Reason(Withdrawal.INVALID_JOINT_STATES, refused))
+            answer = Compensation(None, Reason(Withdrawal.INVALID_JOINT_STATES, refused))
         if problem := second_publisher(self._sources):
-            answer = Compensation.withdrawn(Reason(Withdrawal.SECOND_PUBLISHER, problem))
+            answer = Compensation(None, Reason(Withdrawal.SECOND_PUBLISHER, problem))
         efforts = self._interface.send(now, message, answer)
         self._answers += answer.effort is not None
         self._rides += bool(answer.held and not self._answer.held)
