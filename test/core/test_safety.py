@@ -23,6 +23,7 @@ from exo_gravity.core.safety.shape import STILLNESS
 from exo_gravity.core.safety.start import SWITCH_ON, SignCheck
 from exo_gravity.core.vocabulary import NO_REASON, Reason, Wait
 
+from ..support.copies import prepared
 from ..support.safety_run import EFFORT, LIMITS, PERIOD, SafetyRun, reading
 from ..support.simulated_device import OFF
 
@@ -47,9 +48,12 @@ def confirm(arm: SafetyRun) -> None:
     assert arm.machine.confirm_pose(arm.now) == ""
 
 
+carried_arm = prepared(lambda: SafetyRun().until_active())
+
+
 def carried(arm: SafetyRun) -> None:
-    arm.until_active()
-    arm.steps.clear()
+    """Carry an arm of which nothing was changed."""
+    vars(arm).update(vars(carried_arm()), steps=[])
 
 
 def wait(seconds: float = PERIOD) -> Step:
@@ -364,10 +368,11 @@ ROWS: dict[str, Sequence[Step]] = {
     "a hanging arm for which much torque is asked is refused at an untrusted start only": [
         let(while_hanging=(0.0, 3.8, 0.0, 0.0)),  # of the robot alone, by an IMU that is mounted 90 degrees otherwise
         enable, wait(3.0), see(State.FAULT, "torque_while_hanging"),
-        let(while_hanging=(0.0, 1.0, 0.0, 0.0)), clear, carried,
+        let(while_hanging=(0.0, 1.0, 0.0, 0.0)), clear, enable, until(State.ACTIVE),
     ],
     "confirm: a restart of the motors after an emergency stop asks the operator again": [
-        enable, wait(1.0), confirm, carried, let(silent={0, 1, 2, 3}), wait(0.5), let(off={0, 1, 2, 3}, silent=set()),
+        enable, wait(1.0), confirm, until(State.ACTIVE), wait(0.1),
+        let(silent={0, 1, 2, 3}), wait(0.5), let(off={0, 1, 2, 3}, silent=set()),
         reads(3, position=0.4),  # in the lap, off by a turn of its rotor: within the gate's tolerance
         until(State.FAULT), clear, enable, wait(5.0), see(State.CHECKING, words="the operator to confirm the pose"),
         see(words="d 23"),

@@ -115,8 +115,8 @@ class StruckArm(Rig):
     def take_home(self) -> None:
         """Let the wearer bring the arm near to hanging, and keep it there."""
         home = [0.0, *[0.05] * (len(self.motors) - 1)]
-        self.act(*({"move": home, "over": over} for over in (2.0, 20.0)))
-        self.run(2.5)
+        self.act(*({"move": home, "over": over} for over in (1.0, 20.0)))
+        self.run(1.2)
 
     def are_off(self) -> bool:
         """Return whether every motor is off."""

@@ -52,7 +52,7 @@ ZERO_G = {"mode": "zero_g"}
 AGAIN = [(LEANING, 0.0), (HANGING, 30.0), (HANGING, -30.0)]
 
 
-@pytest.mark.parametrize(("pose", "roll"), quick(AGAIN[:2], AGAIN))
+@pytest.mark.parametrize(("pose", "roll"), quick(AGAIN[:1], AGAIN))
 def test_an_empty_arm_whose_load_is_not_as_believed_when_it_is_carried_again_moves_slowly(pose, roll):
     arm = usual_arm(pose, RATE, peak=PEAK, has_wearer=False, use_imu=bool(roll), mode="one_g")
     arm.act({"move": list(pose), "over": 60.0})
@@ -103,7 +103,7 @@ UPON = [(True, [*WORN, *LEFT]), (False, [ZERO_G, ONE_G] * 4), (False, ALL)]
 
 
 @pytest.mark.parametrize(
-    ("has_wearer", "changes"), quick([UPON[0], UPON[2]], UPON), ids=["worn", "mode", "gain, mode and max_effort"]
+    ("has_wearer", "changes"), quick(UPON[:1], UPON), ids=["worn", "mode", "gain, mode and max_effort"]
 )
 def test_changes_upon_changes_are_as_calm_as_one(has_wearer, changes):
     arm = guided_arm(**({"pose": RAISED} if has_wearer else BARE))

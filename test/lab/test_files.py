@@ -6,13 +6,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-import yaml
 
 from exo_gravity.core.compensation.settings import compensator_table
 from exo_gravity.core.errors import ParameterError
 from exo_gravity.core.motors.joint_motor import OPTIONS
 from exo_gravity.core.params import values_of
-from exo_gravity.core.safety.drive import State
 from exo_gravity.core.safety.limits import CAN_BRIDGE, CONFIRM
 from exo_gravity.core.trunk.params import IMU
 from exo_gravity.core.vocabulary import Source
@@ -49,14 +47,7 @@ def script_to(pose: list[float]) -> TrialScript:
 def test_an_arm_that_ships_is_raised_by_its_wearer_and_stays(name: str) -> None:
     params, script = packaged_config(f"{name}.yaml"), script_to(POSES[name])
     (trial,) = simulated_trials(params, script)
-    held: list[list[float]] = []
-
-    def look(now: float) -> bool:
-        if trial.safety.state is State.ACTIVE:
-            held.append(trial.arm.device.arm.positions)
-        return False
-
-    recording = trial.run(look)
+    recording = trial.run()
     assert not trial.trouble and not trial.events
     released = next(step.start for step in recording.steps if step.action == "hold")
     during = (recording.time > released + 0.5) & (recording.time < released + 2.9)
@@ -104,15 +95,7 @@ def test_every_node_takes_its_parameters_and_every_arm_is_made_of_them(file: str
     for arm in found:
         assert arm.settings.side == arm.side
         assert arm.can_bridge["start_pose"] == CONFIRM  # the one thing that is new to them
-
-
-@pytest.mark.thorough
-@pytest.mark.parametrize("file", ["sim", "sim_both"])
-def test_every_simulated_arm_is_carried_through_a_trial(file: str) -> None:
-    for trial in simulated_trials(THEN / f"{file}.yaml", script_to([0.1, 0.6, 1.2, 0.5])):
-        recording = trial.run()
-        assert trial.trouble == "" and recording.carried
-    assert TrialScript.parse(yaml.safe_load((THEN / "home.yaml").read_text(encoding="utf-8"))).steps
+    assert TrialScript.read(THEN / "home.yaml").steps
 
 
 SIMULATED, REAL, UNKNOWN = Source.SIMULATED, Source.REAL, Source.UNKNOWN

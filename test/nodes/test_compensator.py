@@ -209,9 +209,9 @@ def adds(rig: CompensatorRig, torque: list[float]) -> bool:
     return bool(rig.commands and rig.commands[-1]) and np.allclose(rig.commands[-1] - GRAVITY, torque, atol=1e-6)
 
 
-def loop_that_sends(rig: CompensatorRig, efforts: list[float], topic: str = "assist_efforts"):
-    """Return what publishes these efforts (4,) in Nm, as of a stamp."""
-    publisher, message = rig.user.create_publisher(JointState, topic, 1), JointState(name=NAMES, effort=efforts)
+def loop_that_sends(rig: CompensatorRig, topic: str = "assist_efforts", **fields: list[Any]):
+    """Return what publishes a message of these fields, as of a stamp, and the message."""
+    publisher, message = rig.user.create_publisher(JointState, topic, 1), JointState(**{"name": NAMES, **fields})
 
     def send(stamp: Time) -> None:
         message.header.stamp = stamp
@@ -222,8 +222,8 @@ def loop_that_sends(rig: CompensatorRig, efforts: list[float], topic: str = "ass
 
 @pytest.mark.real_time  # efforts that are 50 ms late are faded, as they must be
 def test_efforts_of_one_outer_loop_are_added_and_the_arm_stays_carried_without_them(rig):
-    ours, message = loop_that_sends(rig, ASSIST)
-    other, _ = loop_that_sends(rig, [0.0, 1.0, 0.0, 0.0])
+    ours, message = loop_that_sends(rig, effort=ASSIST)
+    other, _ = loop_that_sends(rig, effort=[0.0, 1.0, 0.0, 0.0])
     rig.on_cycle = ours
     rig.wait_until(lambda: adds(rig, STILL) and rig.values.get("assist") == "off")
     assert rig.set(assist__max_effort=[1.0] * 4) == [""]
@@ -368,6 +368,18 @@ def test_a_load_is_weighed_on_request_and_one_that_is_dropped_is_no_longer_a_par
     rig.velocity, rig.effort = [0.0, 0.0, 1.5, 2.0], []  # whether the motors carry it is not known
     rig.wait_for({"payload mass (kg)": "0.000"})
     assert rig.node.get_parameter("payload.mass").value == 0.0
+
+
+@pytest.mark.thorough
+def test_a_second_sender_of_requests_raises_no_support(make_rig):
+    rig = make_rig("/right", ADAPTIVE, NAMES, POSE).start()
+    ask, other = (
+        loop_that_sends(rig, topic="support_request", name=["support"], position=[share])[0] for share in (0.8, 0.9)
+    )
+    rig.on_cycle = ask
+    rig.wait_for({"support in use": "0.8"})
+    rig.on_cycle = lambda stamp: (ask(stamp), other(stamp))
+    rig.wait_for({"support in use": "0.4", "support request": "second_publisher"})
 
 
 def is_zero(rig: CompensatorRig) -> bool:

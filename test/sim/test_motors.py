@@ -344,7 +344,7 @@ def test_an_error_switches_the_motor_off_and_comes_back_while_its_cause_stays() 
     assert state(motor, idle) == 0xC  # a hot coil
 
 
-def test_registers_are_told_and_what_is_written_counts_until_the_power_goes_unless_it_is_stored() -> None:
+def test_registers_are_told_what_is_written_counts_until_the_power_goes_unless_it_is_stored_and_a_zero_stays() -> None:
     motor = DamiaoMotor(DAMIAO)
     assert [ask(motor, number, "I") for number in (7, 9, 10)] == [0x13, 4000, 1]
     assert [ask(motor, number) for number in (20, 21, 22, 23)] == [10.0, 12.5, 30.0, 10.0]
@@ -356,5 +356,10 @@ def test_registers_are_told_and_what_is_written_counts_until_the_power_goes_unle
         ask(motor, register, kind, operation, value)
     play(motor, ENTER, DAMIAO.command(2.0, 0.0))
     assert last_torque(motor, 1.0) == pytest.approx(4.0, abs=0.02)  # the same code, another torque; and no time-out
+    refresh = motor.receive(bytes((3, 0, 0xCC, 0, 0, 0, 0, 0)), 0.3, 0.0, 0.0, REGISTERS)
+    assert refresh == motor.receive(DAMIAO.command(5.0, 0.0), 0.3, 0.0, 0.0, 0x103) and refresh[0] == 0x13
+    assert last_torque(motor, 1.0) == pytest.approx(4.0, abs=0.02)  # which a command of another mode does not change
+    assert [state(motor, data) for data in (EXIT, SET_ZERO)] == [0, 0]
     without_power_for_a_moment(motor)
     assert (ask(motor, TMAX), ask(motor, PMAX)) == pytest.approx((10.0, 12.566))
+    assert DAMIAO.sample(motor.receive(EXIT, 0.3, 0.0, 0.0, 3), 0.0).position == pytest.approx(0.0, abs=0.001)

@@ -37,7 +37,7 @@ def own_budget(springs=SLACK, support=1.0, tilt=20.0, low=LOW, high=HIGH, rated=
 needs = functools.cache(own_budget)
 
 
-@pytest.mark.parametrize("support", [0.0, 0.4, 1.0])
+@pytest.mark.parametrize("support", quick([0.4], [0.0, 0.4, 1.0]))
 def test_each_joints_largest_torque_is_that_of_the_straight_horizontal_arm_and_joint_1_feels_a_tilted_trunk(support):
     carrying, tilt = ROBOT.with_wearer(*LOAD, support), math.radians(20.0)
     m1, m2, m3, m4 = (carrying.gravity * moment for moment in carrying.first_moment)

@@ -37,6 +37,7 @@ from ...support import synthetic_bags as made
 Entries = Iterable[made.Entry]
 
 SECOND = 10**9
+ZSTD = b"\x28\xb5\x2f\xfd"  # how each frame begins
 STATES, COMMANDS, STEPS = (f"/right/{name}" for name in ("joint_states", "effort_commands", "wearer_step"))
 PARAMETERS, SESSION = "/recorder/parameters", "/recorder/session"
 TRIAL = made.trial(made.POSES, hold=6.0, rate=50.0)
@@ -121,6 +122,15 @@ def test_a_recording_cut_short_gives_the_chunks_before_and_one_that_lacks_only_i
     found = read_bag(bag)
     assert 0.1 < len(found.recordings[0].time) / whole < 0.7
     assert "cut short" in found.notes[0] and found.is_partial
+
+
+def test_a_damaged_chunk_is_left_out_and_named(tmp_path):
+    file = made.write_bag(tmp_path / "bag", CONTENT * 12, compression=CompressionMode.STORAGE) / "bag.mcap"
+    head, first, second, *others = file.read_bytes().split(ZSTD)
+    file.write_bytes(ZSTD.join((head, first, bytes(36) + second[36:], *others)))
+    report, arm, _ = report_of(file.parent)
+    assert "the recording is damaged: parts left out: 1" in report.notes and report.bag.is_partial
+    assert len(TRIAL.time) < len(arm.time) < 12 * len(TRIAL.time)
 
 
 def test_a_write_ahead_log_on_a_read_only_medium_is_read(tmp_path):

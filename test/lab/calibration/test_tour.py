@@ -312,7 +312,10 @@ def test_the_mass_matrix_is_close_to_that_of_the_device(mass, lever, tolerance):
         np.testing.assert_allclose(MODEL.matrix(theta, (mass, lever)), true, atol=tolerance)
 
 
-@pytest.mark.parametrize(("moments", "tilt", "count", "again"), [(MOMENTS, UPRIGHT, 4, 2), (WEIGHED, LEANT, 8, 0)])
+@pytest.mark.parametrize(
+    ("count", "again", "moments", "tilt"),
+    [(4, 2, MOMENTS, UPRIGHT), pytest.param(8, 0, WEIGHED, LEANT, marks=pytest.mark.thorough)],
+)
 def test_chosen_poses_their_sweeps_and_the_way_home_are_within_limits_and_the_first_are_visited_again(
     moments, tilt, count, again
 ):
