@@ -24,7 +24,7 @@ panel:  # the simulated right arm and the operator's page, until Ctrl-C
 
 # Tests of running nodes need a machine that keeps up with them: they run alone. The other ones share a module's nodes
 # and simulations: each file runs in one process.
-test:  # the tests, 4 to 8 minutes on two cores; .ci/test-long plays the longer ones
+test:  # the tests, 4 minutes on two idle cores; .ci/test-long plays the longer ones
 	@$(SETUP) @test
 	$(BIN)/python -m pytest --ignore test/bench -n auto --dist loadfile -m "not (real_time or browser or thorough)"
 	$(BIN)/python -m pytest $$(grep -rl mark.real_time --include='test_*.py' test/hardware test/nodes) \

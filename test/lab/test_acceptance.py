@@ -94,11 +94,15 @@ def test_a_device_as_its_file_says_passes_every_step_and_leaves_a_record():
     assert not record(results[:-1], "right", Source.REAL)["passed"]  # a step is missing
 
 
-def test_an_arm_from_a_urdf_passes_every_step_and_a_weight_that_its_last_joint_hardly_feels_is_refused():
-    results = acceptance("three_joints", ON_URDF)
-    assert failed(results) == "", results[-1].sentence
-    results = acceptance("three_joints", Weight(0.05, 0.02))
-    assert failed(results) == "torque" and "must be at least 0.3: take a heavier one" in results[-1].sentence
+HUNG = [(ON_URDF, "", ""), (Weight(0.05, 0.02), "torque", "must be at least 0.3: take a heavier one")]
+
+
+@pytest.mark.parametrize(("weight", "step", "said"), quick(HUNG[1:], HUNG))
+def test_an_arm_from_a_urdf_passes_every_step_and_a_weight_that_its_last_joint_hardly_feels_is_refused(
+    weight, step, said
+):
+    results = acceptance("three_joints", weight)
+    assert failed(results) == step and said in results[-1].sentence
 
 
 SPOILT = {  # what is the case, the step that fails, and what is said
