@@ -403,6 +403,9 @@ ROWS: dict[str, Sequence[Step]] = {
         for name, pitch, roll in (("a trunk on its back", -1.57, 0.0), ("one by a wrong IMU upside down", 0.0, 3.1))
     },
     "lying: a person who lies may start, as the parameters say": [leans(-1.57), enable, until(State.ACTIVE)],
+    "confirm: the calm second passes while the operator looks at the arm": [
+        enable, wait(1.5), see(State.CHECKING), confirm, wait(0.05), see(State.PROVING),
+    ],
     "confirm: there is nothing to confirm while the arm is disabled": [
         has(lambda arm: arm.machine.confirm_pose(arm.now).startswith("nothing to confirm: the arm is disabled")),
     ],

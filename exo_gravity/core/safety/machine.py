@@ -70,7 +70,7 @@ class SafetyMachine:
     state: the State. fault: the latched Fault or None. waiting_for: what CHECKING or PROVING waits for. refusal: why
     the last enable was refused without a fault. acted: for each limit that has acted, by name, the last time. watch:
     what is known of each motor. ride: through late efforts. motion: judges the efforts by gravity alone. pose: the
-    question to the operator whether the arm hangs as it is drawn.
+    question to the operator whether the arm hangs as it is drawn. signs: the proof of signs.
     """
 
     def __init__(self, limits: Limits, period: float, motors: Sequence[JointMotor] = ()) -> None:
@@ -96,7 +96,7 @@ class SafetyMachine:
         self.motion = MotionMonitor(limits)
         self._switching = SwitchingOn(self.watch.replies)
         self._switch_on = SwitchOnCheck(limits)
-        self._signs = SignCheck(limits.joint_names, self._none)
+        self.signs = SignCheck(limits.joint_names, self._none)
         self._left: Sequence[float] = ()  # Nm, what another process left the motors with
         self._attempts = 0  # to switch a motor on again that shows no torque while it is pushed
         #: Whether the last drive did not leave for each motor (n,), set from outside: that motor holds what it had.
@@ -285,17 +285,17 @@ class SafetyMachine:
             missing = Reason(Wait.EFFORTS, "effort commands")
         if not missing and not self._all_off:
             missing = Reason(Wait.MOTORS_OFF, "the motors to confirm that they are off")
+        if missing:
+            self._calm_since = self._now
         asks = not watch.trusted and limits.start_pose == CONFIRM
         patience = limits.enable_timeout + (HANGING_ARM.patience if asks else 0.0)
         if watch.fault:
             self.pose.withdraw()
         if asks:
             missing = self.pose.missing(self._now, watch.samples, missing)
-        # While the bridge cannot switch motors on the calm second passes: its watchdog starts meanwhile.
+        # While the bridge cannot switch motors on, and while the operator looks at the arm, the calm second passes.
         self.waiting_for = self.hindrance or missing or Reason(Wait.CALM, f"{START_GATE.calm:g} s without a fault")
-        if missing:
-            self._calm_since = self._now
-        is_calm = not self.hindrance and self._now - self._calm_since >= START_GATE.calm
+        is_calm = not (self.hindrance or missing) and self._now - self._calm_since >= START_GATE.calm
         if is_calm and effort is not None and not ride.is_riding:
             fault = None if watch.trusted else torque_while_hanging(limits, effort)
             if fault:
@@ -305,7 +305,7 @@ class SafetyMachine:
             largest = 0.0 if watch.trusted else limits.sign_check_torque
             self._switching, self._attempts = SwitchingOn(self.watch.replies), 0
             self._switch_on = SwitchOnCheck(limits)
-            self._signs = SignCheck(limits.joint_names, [min(largest, most) for most in limits.max_effort])
+            self.signs = SignCheck(limits.joint_names, [min(largest, most) for most in limits.max_effort])
             watch.reset_delivery()
             self._on(StateEvent.PASSED)
         elif self._now - self._since >= patience:
@@ -319,14 +319,14 @@ class SafetyMachine:
             self.watch.reset_delivery()
             return
         joints = self.watch.samples
-        if self._signs.done:  # before, or there is nothing to check: they are trusted
+        if self.signs.done:  # before, or there is nothing to check: they are trusted
             fault = self._switch_on.step(self._dt, joints, self._sent.damping)
             self.watch.reset_delivery()
         else:
-            fault = self._signs.step(self._dt, joints, asked)
-        self.waiting_for = self._signs.hint
+            fault = self.signs.step(self._dt, joints, asked)
+        self.waiting_for = self.signs.hint
         self._latch(fault, self._now)
-        if not fault and self._signs.done and (self._switch_on.done or self._signs.pushes):
+        if not fault and self.signs.done and (self._switch_on.done or self.signs.pushes):
             self.watch.trusted = True
             self.motion.reset()
             self._rise.begin((1.0,) * len(self._none))
@@ -339,9 +339,9 @@ class SafetyMachine:
         """
         if not self._switching.done:
             return self._powered(self._none, self._none, self._switching.step())
-        if self._signs.pushes:
+        if self.signs.pushes:
             again = [motor.is_missing for motor in self.watch.joints]
-            pushed, damped = self._signs.effort, self._signs.damped
+            pushed, damped = self.signs.effort, self.signs.damped
         else:
             pushed, again, damped = self._switch_on.effort, self._switch_on.enter, [True] * len(self._none)
         if any(again):

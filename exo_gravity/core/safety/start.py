@@ -294,8 +294,7 @@ class SwitchOnCheck:
         self._pushes = pushes
         for i, torque in enumerate(self._torque):
             target = 0.0 if all(self._is_on) else -torque if pushes % 2 else torque
-            step = MAX_EFFORT_RATE * dt
-            self.effort[i] = limited(target, self.effort[i], step)
+            self.effort[i] = limited(target, self.effort[i], MAX_EFFORT_RATE * dt)
         self.done = all(self._is_on) and not any(self.effort)
         return None
 
@@ -303,12 +302,14 @@ class SwitchOnCheck:
 class SignCheck:
     """Checks that each motor pushes its joint the way that its encoder shows, while the arm hangs.
 
-    Joint after joint: wait until it is still, push it gently and slowly until it moves by about a degree, then push it
-    back the other way. Whichever way it moves, the push is taken back while the joint is faster than `SIGN_PUSH.slow`:
-    without damping, friction alone then stops it. A joint that moves backwards has its torque or its encoder reversed:
-    gravity compensation would double its weight. A joint that does not move has no torque, or is held. A joint that
-    moves before it is pushed is being moved by the wearer: the check starts again, a few times. It cannot detect a
-    `direction` that reverses torque and encoder alike: such a joint moves as expected.
+    Joint after joint, first one way, then the other: wait until the joint has been still, push it gently and slowly
+    until it moves by about a degree. Whichever way it moves, the push is taken back while the joint is faster than
+    `SIGN_PUSH.slow`: without damping, friction alone then stops it. A joint that moves backwards has its torque or its
+    encoder reversed: gravity compensation would double its weight. A joint that does not move has no torque, or is
+    held. A joint that moves before it is pushed is being moved by the wearer: it is pushed again, a few times. It
+    cannot detect a `direction` that reverses torque and encoder alike: such a joint moves as expected.
+
+    One joint is pushed at a time: a push turns others, too, so that two at once could prove a reversed motor right.
 
     How soon the joints move shows two with exchanged CAN IDs (`JointOrder`); they are pushed again before that is a
     fault.
@@ -319,7 +320,7 @@ class SignCheck:
     effort: (n,) Nm to apply now.
     damped: (n,) which joints have moved the right way: these may be damped.
     done: whether every joint has passed. pushes: whether it pushes any joint at all.
-    hint: what the wearer should do.
+    hint: what the wearer should do. progress: 0..1, the share of the pushes that are done.
     """
 
     def __init__(self, names: Sequence[str], torque: Sequence[float]) -> None:
@@ -327,11 +328,12 @@ class SignCheck:
         self.damped = [False] * len(names)
         self.pushes = any(torque)
         self.done = not any(torque)
-        self.hint = NO_REASON
+        self.hint, self.progress = NO_REASON, 0.0
         self._names = names
         self._dt = 0.0
         self._position = [math.nan] * len(names)  # rad
         self._velocity = [math.nan] * len(names)  # rad/s
+        self._still_at, self._still_for = [math.inf] * len(names), [0.0] * len(names)  # rad, and s without a push
         self._order = JointOrder(names)
         self._course = self._check_all(torque)
 
@@ -343,6 +345,11 @@ class SignCheck:
         """
         self._dt = dt
         self._position, self._velocity = [joint.position for joint in joints], [joint.velocity for joint in joints]
+        for i, position in enumerate(self._position):
+            if self.effort[i] == 0.0 and abs(position - self._still_at[i]) <= SIGN_PUSH.still:
+                self._still_for[i] += dt
+            else:
+                self._still_at[i], self._still_for[i] = position, 0.0
         self._order.note(joints, asked)
         return next(self._course, None)
 
@@ -352,65 +359,69 @@ class SignCheck:
         joints: Sequence[int] = [i for i, most in enumerate(torque) if most]
         for _ in range(JOINT_ORDER.rounds):
             for i in joints:
-                yield from self._check(i, torque[i])
+                self.damped[i] = False
+            pushes = [(i, sign) for sign in (1.0, -1.0) for i in joints]
+            for n, (i, sign) in enumerate(pushes):
+                self.progress = n / len(pushes)
+                yield from self._check(i, sign, torque[i])
             if not (joints := self._order.exchanged):
                 break
         if joints:
             yield self._order.fault
-        self.done = True
+        while any(self.effort):
+            self._take_back()
+            yield None
+        self.done, self.progress = True, 1.0
 
-    def _check(self, i: int, most: float) -> Iterator[Fault | None]:
+    def _check(self, i: int, sign: float, most: float) -> Iterator[Fault | None]:
         for _ in range(SIGN_PUSH.disturbed + 1):
-            if (yield from self._push_both_ways(i, most)):
+            if (yield from self._push(i, sign, most)):
                 break
             self.hint = Reason(Wait.HOLD_STILL, f"{self._names[i]} moves without being pushed: hold still")
         else:
             yield self._fault(i, "it moves without being pushed: hold still and let it hang")
-        while self.effort[i]:
-            self._approach(i, 0.0, SIGN_PUSH.fall)
-            yield None
         self.hint = NO_REASON
 
     def _wait_for_rest(self, i: int) -> Iterator[Fault | None]:
-        start, still, waited = math.inf, 0.0, 0.0
-        while still < SIGN_PUSH.still_time:
-            self._approach(i, 0.0, SIGN_PUSH.fall)
-            still, waited = still + self._dt, waited + self._dt
-            if not abs(self._position[i] - start) <= SIGN_PUSH.still or self.effort[i] != 0.0:
-                start, still = self._position[i], 0.0
-            is_late = waited > SIGN_PUSH.rest_timeout and still < SIGN_PUSH.still_time
-            yield self._fault(i, "it does not come to rest: hold still and let it hang") if is_late else None
+        waited = 0.0
+        while any(self.effort) or self._still_for[i] < SIGN_PUSH.still_time:
+            self._take_back()
+            waited += self._dt
+            fault = self._fault(i, "it does not come to rest: hold still and let it hang")
+            yield fault if waited > SIGN_PUSH.rest_timeout else None
 
-    def _push_both_ways(self, i: int, most: float) -> Generator[Fault | None, None, bool]:
-        """Return whether the joint moved under a push each way, False if it moved without one."""
-        self.damped[i] = False
-        for sign in (1.0, -1.0):
-            yield from self._wait_for_rest(i)
-            self._order.begin(i)
-            start, push, at_full, waited = self._position[i], 0.0, 0.0, 0.0
-            while not abs(moved := sign * (self._position[i] - start)) >= SIGN_PUSH.moved:
-                if at_full > SIGN_PUSH.timeout:
-                    yield self._fault(i, f"{push:.2f} Nm did not move it: let it hang freely")
-                if waited > SIGN_PUSH.patience:
-                    return False
-                if abs(self._velocity[i]) > SIGN_PUSH.slow:
-                    self._approach(i, 0.0, SIGN_PUSH.fall)
-                else:
-                    is_held = self.damped[i] or abs(self.effort[i]) < SIGN_PUSH.held * abs(push)
-                    self._approach(i, sign * most, SIGN_PUSH.quick if is_held else SIGN_PUSH.rise)
-                push = max(push, self.effort[i], key=abs)
-                at_full += self._dt if abs(self.effort[i]) >= most else 0.0
-                waited += self._dt
-                yield None
-            if waited < SIGN_PUSH.soonest:
+    def _push(self, i: int, sign: float, most: float) -> Generator[Fault | None, None, bool]:
+        """Return whether the joint moved under a push this way, False if it moved without one."""
+        yield from self._wait_for_rest(i)
+        self._order.begin(i)
+        start, push, at_full, waited = self._position[i], 0.0, 0.0, 0.0
+        while not abs(moved := sign * (self._position[i] - start)) >= SIGN_PUSH.moved:
+            if at_full > SIGN_PUSH.timeout:
+                yield self._fault(i, f"{push:.2f} Nm did not move it: let it hang freely")
+            if waited > SIGN_PUSH.patience:
                 return False
-            if moved < 0.0:
-                reason = f"{push:.2f} Nm moved it backwards: torque or encoder is reversed"
-                yield self._fault(i, reason, FaultCode.WRONG_SIGN)
-            if not self.damped[i]:
-                self._order.end(SIGN_PUSH.slow)
-            self.damped[i] = True
+            if abs(self._velocity[i]) > SIGN_PUSH.slow:
+                self._approach(i, 0.0, SIGN_PUSH.fall)
+            else:
+                is_held = self.damped[i] or abs(self.effort[i]) < SIGN_PUSH.held * abs(push)
+                self._approach(i, sign * most, SIGN_PUSH.quick if is_held else SIGN_PUSH.rise)
+            push = max(push, self.effort[i], key=abs)
+            at_full += self._dt if abs(self.effort[i]) >= most else 0.0
+            waited += self._dt
+            yield None
+        if waited < SIGN_PUSH.soonest:
+            return False
+        if moved < 0.0:
+            reason = f"{push:.2f} Nm moved it backwards: torque or encoder is reversed"
+            yield self._fault(i, reason, FaultCode.WRONG_SIGN)
+        if not self.damped[i]:
+            self._order.end(SIGN_PUSH.slow)
+        self.damped[i] = True
         return True
+
+    def _take_back(self) -> None:
+        for i in range(len(self.effort)):
+            self._approach(i, 0.0, SIGN_PUSH.fall)
 
     def _approach(self, i: int, effort: float, rate: float) -> None:
         """Bring the push on joint `i` nearer to `effort` (Nm), by at most `rate` (Nm/s)."""

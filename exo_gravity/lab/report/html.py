@@ -181,6 +181,7 @@ def _embed(svg: Path, font: str) -> None:
     from matplotlib.font_manager import findfont
 
     text, options = svg.read_text(encoding="utf-8"), subset.Options(flavor="woff")
+    options.drop_tables += ["FFTM"]  # the date of FontForge, of which fontTools would warn
     face, buffer = subset.load_font(findfont(font), options), BytesIO()
     chooser = subset.Subsetter(options)
     chooser.populate(text=text)

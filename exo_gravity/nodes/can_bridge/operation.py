@@ -377,6 +377,7 @@ class BridgeReport:
         return {
             "waiting for": waiting.word,
             "waiting text": waiting,
+            "signs proven (%)": row([100.0 * safety.signs.progress], 0),
             "refusal": safety.refusal.word,
             "refusal text": safety.refusal,
             "joints outside limits": words(*[self._names[n] for n in turns]),

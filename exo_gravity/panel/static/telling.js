@@ -77,6 +77,7 @@ function usually(arm, name, state, moving) {
   const [refusal] = list(bridge.refusal);
   if (name === "disabled" && refusal) return { why: waitText(arm, refusal, bridge, true), todo: t("then.enable") };
   const [wait] = list(bridge["waiting for"]);
+  if (name === "proving signs" && !wait) return { why: join([texts(name).why, t("proof", bridge["signs proven (%)"])]), todo: texts(name).todo };
   if (!wait || wait === "pose") return texts(name === "inactive" ? "disabled" : name);
   const reason = wait === "efforts" ? reasonText(compensator) : "";
   return { why: join([waitText(arm, wait, bridge, false), reason]), todo: "" };
