@@ -11,7 +11,7 @@ import pytest
 
 from exo_gravity.core.compensation.compensator import Compensator
 from exo_gravity.core.compensation.settings import COMPENSATOR, Settings, compensator_table, settings_of
-from exo_gravity.core.motors.families import others
+from exo_gravity.core.motors.families import every_family
 from exo_gravity.core.motors.joint_motor import motors_of
 from exo_gravity.core.params import installed, values_of
 from exo_gravity.core.safety.limits import CAN_BRIDGE, check_bridge, limits_of
@@ -55,13 +55,13 @@ def push(**given: Any) -> tuple[list[str], list[float]]:
 def test_a_laboratory_s_own_motor_term_and_law_need_no_fork_and_all_bounds_hold(
     monkeypatch: pytest.MonkeyPatch, request: pytest.FixtureRequest
 ) -> None:
-    for found in (others, installed):
+    for found in (every_family, installed):
         found.cache_clear()
         request.addfinalizer(found.cache_clear)
     carry(motor=["AK60-6"] * 4)
     arm = {"use_imu": False, "max_effort": [9.0] * 4}
     assert push(**arm)[0] == []
-    assert others.cache_info().misses == installed.cache_info().misses == 0  # our motors alone: none is looked up
+    assert every_family.cache_info().misses == installed.cache_info().misses == 0  # our motors alone: none is looked up
     monkeypatch.syspath_prepend(ROOT / "test" / "support" / "our_lab")
     assert carry(motor=["OUR-1", "AK80-9", "OUR-1", "AK60-6"], wire_format=["ours", "mit", "ours", "mit_v3"]) == {
         "on": [True] * 4,

@@ -11,10 +11,11 @@ from collections.abc import Callable, Iterator, Mapping
 from functools import cache
 from typing import TypeVar
 
-from exo_gravity.core.errors import DataError, ParameterError
+from exo_gravity.core.errors import ParameterError
 from exo_gravity.core.motors.ak import AK
 from exo_gravity.core.motors.damiao import DAMIAO
 from exo_gravity.core.motors.frames import Family, MotorSpec, WireFormat
+from exo_gravity.core.params import installed, loaded
 
 GROUP = "exo_gravity.motor_families"
 OURS = (AK, DAMIAO)
@@ -38,7 +39,7 @@ class ByName(Mapping[str, Item]):
         return name in self._ours or name in self._all
 
     def __iter__(self) -> Iterator[str]:
-        return iter(self._all if others.cache_info().currsize else self._ours)
+        return iter(self._all if every_family.cache_info().currsize else self._ours)
 
     def __len__(self) -> int:
         return sum(1 for _ in self)
@@ -56,27 +57,17 @@ def _joined(of: Callable[[Family], Mapping[str, Item]], families: tuple[Family, 
 
 
 @cache
-def others() -> tuple[Family, ...]:
-    """Return the families of other distributions. Raises DataError that names the entry point that does not work."""
-    from importlib.metadata import entry_points  # slow to import
-
-    found: list[Family] = []
-    for entry in entry_points(group=GROUP):
-        try:
-            family = entry.load()
-            names = {family.name, *family.motors}
-        except Exception as error:  # the code of others
-            raise DataError(f"entry point {entry.name} = {entry.value} of {GROUP}: {error}") from error
-        known = {name for other in (*OURS, *found) for name in (other.name, *other.motors)}
-        if taken := names & known:
-            raise DataError(f"entry point {entry.name} = {entry.value} of {GROUP}: {', '.join(sorted(taken))}: taken")
+def every_family() -> tuple[Family, ...]:
+    """Return our own families, and those of other distributions. Raises ParameterError that names the entry point."""
+    found = list(OURS)
+    for name, entry in installed(GROUP).items():
+        family: Family = loaded(GROUP, name, "motor family")
+        known = {name for other in found for name in (other.name, *other.motors)}
+        if taken := {family.name, *family.motors} & known:
+            expected = f"without {', '.join(sorted(taken))}, taken by another: {entry.value} of {GROUP}"
+            raise ParameterError("motor family", name, expected)
         found.append(family)
     return tuple(found)
-
-
-def every_family() -> tuple[Family, ...]:
-    """Return our own families, and those of other distributions. Raises DataError."""
-    return (*OURS, *others())
 
 
 FAMILIES: Mapping[str, Family] = ByName(lambda family: {family.name: family})

@@ -234,22 +234,16 @@ class SafetyMachine:
             self._attempts += 1
         if self.watch.fault:
             return self.watch.fault
-        if self.state in CARRIED and (found_off := self._found_off()):
-            return found_off
+        off = [motor for motor in self.watch.joints if motor.power is Power.ON and motor.reports_off]
+        if self.state in CARRIED and off:
+            why = f": {off[0].sample.trouble}" if off[0].sample.trouble else ""
+            return Fault.of_joint(FaultCode.TORQUE_NOT_DELIVERED, off[0].name, f"its motor says that it is off{why}")
         if self.shaper.empty_for >= STILLNESS.empty:
             why = "the arm moved off as if it were empty: is an arm in the cuff, the load in the hand, the IMU fixed?"
             return Fault(FaultCode.LOAD_MISSING, why)
         if efforts.effort is None:
             return Fault(FaultCode.COMMAND_WITHDRAWN, "the compensator withdrew its efforts; see its diagnostics")
         return self.ride.step(self._now, self._dt, self._now - efforts.answered, efforts.held)
-
-    def _found_off(self) -> Fault | None:
-        """Return the fault of a motor that was switched on, and whose replies say that it is off."""
-        for motor in self.watch.joints:
-            if motor.power is Power.ON and motor.reports_off:
-                why = f": {motor.sample.trouble}" if motor.sample.trouble else ""
-                return Fault.of_joint(FaultCode.TORQUE_NOT_DELIVERED, motor.name, f"its motor says that it is off{why}")
-        return None
 
     def _drive(self, effort: Sequence[float], damped: bool) -> Drive:
         if self.state in CARRIED:

@@ -11,6 +11,7 @@ from exo_gravity.core.errors import ParameterError
 from exo_gravity.core.motors import ak as ak_family
 from exo_gravity.core.motors import damiao as damiao_family
 from exo_gravity.core.motors.joint_motor import JointMotor
+from exo_gravity.core.params import installed, loaded
 from exo_gravity.sim.motors.ak import Heat, SimulatedMotor
 from exo_gravity.sim.motors.damiao import DamiaoMotor
 from exo_gravity.sim.motors.firmware import Firmware
@@ -26,12 +27,10 @@ def class_of(family: str) -> type[SimulatedMotor]:
     """Return what simulates the motors of a family. Raises ParameterError if nothing does."""
     if family in OURS:
         return OURS[family]
-    from importlib.metadata import entry_points  # slow to import
-
-    for entry in entry_points(group=GROUP, name=family):
-        found: type[SimulatedMotor] = entry.load()
-        return found
-    raise ParameterError("motor", family, f"of a family with an entry point of {GROUP}, to be simulated")
+    if family not in installed(GROUP):
+        raise ParameterError("motor", family, f"of a family with an entry point of {GROUP}, to be simulated")
+    found: type[SimulatedMotor] = loaded(GROUP, family, "simulated motor")
+    return found
 
 
 def simulated(joint: JointMotor, firmware: Firmware | None = None, heat: Heat | None = None) -> SimulatedMotor:
