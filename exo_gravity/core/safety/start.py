@@ -393,7 +393,8 @@ class SignCheck:
     def _push(self, i: int, sign: float, most: float) -> Generator[Fault | None, None, bool]:
         """Return whether the joint moved under a push this way, False if it moved without one."""
         yield from self._wait_for_rest(i)
-        self._order.begin(i)
+        if not self.damped[i]:
+            self._order.begin(i)
         start, push, at_full, waited = self._position[i], 0.0, 0.0, 0.0
         while not abs(moved := sign * (self._position[i] - start)) >= SIGN_PUSH.moved:
             if at_full > SIGN_PUSH.timeout:
@@ -415,7 +416,7 @@ class SignCheck:
             reason = f"{push:.2f} Nm moved it backwards: torque or encoder is reversed"
             yield self._fault(i, reason, FaultCode.WRONG_SIGN)
         if not self.damped[i]:
-            self._order.end(SIGN_PUSH.slow)
+            self._order.end(i, SIGN_PUSH.slow)
         self.damped[i] = True
         return True
 
@@ -486,9 +487,8 @@ class JointOrder:
         self._ends: list[list[Extreme]] = [[] for _ in names]  # the two ends of each joint's motion while it was pushed
 
     def begin(self, i: int) -> None:
-        """Note that joint `i` is pushed from now on."""
-        self._pushed = i
-        self._path = [self._joints[i]]
+        """Note that joint `i` is pushed from now on, the first way."""
+        self._pushed, self._path = i, [self._joints[i]]
 
     def note(self, joints: Sequence[JointSample], asked: Sequence[float]) -> None:
         """Take the newest readings (n,), and what the controller asks for, (n,) Nm."""
@@ -502,14 +502,13 @@ class JointOrder:
         here = [*ends, Extreme(sample.position, tuple(joint.position for joint in joints), tuple(asked))]
         ends[:] = min(here), max(here)
 
-    def end(self, slow: float) -> None:
-        """Note that a push has moved its joint, and was taken back once that was faster than `slow` rad/s."""
-        if self._pushed is None:
-            return
+    def end(self, i: int, slow: float) -> None:
+        """Note that the push has moved joint `i`, and was taken back once that was faster than `slow` rad/s."""
         start = self._path[0].position
         left = _reached([(sample.time, sample.position - start) for sample in self._path], JOINT_ORDER.left)
         quick = _reached([(sample.time, sample.velocity) for sample in self._path], slow)
-        self._times[self._pushed].append(max(0.0, quick - left))
+        self._times[i].append(max(0.0, quick - left))
+        self._pushed = None
 
     @property
     def exchanged(self) -> tuple[int, ...]:
