@@ -278,9 +278,8 @@ ROWS: dict[str, Sequence[Step]] = {
         ]
         for name, late in {"a late tilt": {"held": True}, "late efforts": TOO_LATE}.items()
     },
-    "after a pause of the loop itself all joints are damped at once, and only the age of the efforts counts": [
+    "after a pause of the loop itself only the age of the efforts counts": [
         carried, let(effort_age=0.1), stall(0.1), see(State.ACTIVE),  # no motor was asked; the ride has only begun
-        has(lambda arm: min(arm.drive.damping) == DAMPING),
         let(effort_age=RIDE.longest_age + PERIOD), wait(), see(fault="command_stale"),
     ],
     **{

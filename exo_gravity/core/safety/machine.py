@@ -205,7 +205,7 @@ class SafetyMachine:
             self._check(efforts)
         elif self.state in CARRYING:
             self._latch(self._carried_fault(efforts), self._now)
-        self._latch(watch.step_pause(now, self._dt, self._sent.effort, self.state in CARRIED), now)
+        self._latch(watch.judge_pause(now, self._sent.effort, self.state in CARRIED), now)
         effort = efforts.effort
         if effort is not None and self.state in CARRIED:
             effort, fault = self.motion.step(self._dt, watch.samples, effort, now - efforts.answered)
@@ -355,9 +355,7 @@ class SafetyMachine:
         is_guided = damped or self.state is State.RAMPING_IN
         share = [1.0 - left for left in self._rise.shares]
         late = DAMPING if self.ride.is_riding else 0.0
-        torque, damping = self.shaper.shape(
-            self._dt, joints, effort, share, self._sent.effort, is_guided, late, self.watch.pause_damping
-        )
+        torque, damping = self.shaper.shape(self._dt, joints, effort, share, self._sent.effort, is_guided, late)
         self.acted.update(dict.fromkeys(self.shaper.acted, self._now))
         return self._powered(torque, damping, self._commands)
 

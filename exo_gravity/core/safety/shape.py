@@ -3,8 +3,8 @@
 
 `shape` limits the torque of an arm that is carried, in this order: soft wall before a joint limit, clamp to the
 permitted torque (derated when hot), rate limit. Its damping is the largest that any cause asks for. What a guided
-motion, late efforts, and torque that a moving joint does not get ask for rises and falls slowly; what the soft wall and
-a pause of the loop ask for counts at once.
+motion, late efforts, and torque that a moving joint does not get ask for rises and falls slowly; what the soft wall
+asks for counts at once.
 
 `damping` then bounds each drive that leaves the safety machine, whether the arm is carried or let down. With tau the
 feed-forward of a joint, v > 0 its speed along tau, V = `driven_speed` and F = V + BARRIER.span, the motor gets at least
@@ -126,7 +126,6 @@ class JointShaper:
         before: float,
         is_guided: bool,
         late: float,
-        pause: float,
         is_empty: bool,
         acted: set[str],
     ) -> tuple[float, float]:
@@ -152,7 +151,7 @@ class JointShaper:
             "max_effort_rate": given != clamped,
         }
         acted.update([f"{name} ({self._name})" for name, acts in limiting.items() if acts])
-        return given, max(self._slowly, wall, pause, self._hold(dt, sample, given, is_empty, is_guided))
+        return given, max(self._slowly, wall, self._hold(dt, sample, given, is_empty, is_guided))
 
     def _hold(self, dt: float, sample: JointSample, effort: float, is_empty: bool, is_guided: bool) -> float:
         """Return the damping in Nm s/rad of a joint that is still, or whose arm seems to be empty.
@@ -243,7 +242,6 @@ class Shaper:
         before: Sequence[float],
         is_guided: bool,
         late: float = 0.0,
-        pause: float = 0.0,
     ) -> tuple[tuple[float, ...], tuple[float, ...]]:
         """Return torque (n,) in Nm and damping (n,) in Nm s/rad of a carried arm.
 
@@ -252,14 +250,14 @@ class Shaper:
         share: 0..1, the factor (n,) on effort and soft wall where torque begins.
         before: the torque of the last drive, (n,) Nm.
         is_guided: whether the torque is guided.
-        late, pause: the damping that late efforts and a pause ask for, Nm s/rad.
+        late: the damping that late efforts ask for, Nm s/rad.
 
         Raises ParameterError if an effort is NaN or beyond `max_command`.
         """
         self.acted = set()
         columns = zip(self._joints, samples, effort, share, before, strict=True)
         given = [
-            joint.shape(dt, sample, asked, part, last, is_guided, late, pause, self.empty_for > 0.0, self.acted)
+            joint.shape(dt, sample, asked, part, last, is_guided, late, self.empty_for > 0.0, self.acted)
             for joint, sample, asked, part, last in columns
         ]
         is_empty = self.empty_for or any(joint.is_sudden for joint in self._joints)

@@ -35,7 +35,7 @@ summed over the replies, so that noise of 0.15 Nm cancels and a lost frame adds 
 
 A pause of the loop. A motor's firmware may let go of its joint if no command comes for a while, without damping and
 without a word, and the next command brings the torque back at once (docs/wiring.md). A reply only follows that command:
-so the first one after a pause is given with full damping, and the readings that follow tell whether a joint fell.
+the readings after it tell whether a joint fell.
 
 Chosen against ordinary equipment: 3 % of the frames lost each way, a computer that is late by 20 ms in one cycle of
 ten, adapters that deliver in batches of 1 ms, velocities of 12 bits without a code for 0 that lag by 20 ms, knocks at
@@ -50,7 +50,7 @@ from enum import Enum
 
 from exo_gravity.core.motors.joint_motor import UNKNOWN, JointMotor, JointSample
 from exo_gravity.core.safety.drive import Fault, FaultCode, Send
-from exo_gravity.core.safety.limits import DAMPING, DAMPING_RATE, HEAT, READING, Limits
+from exo_gravity.core.safety.limits import HEAT, READING, Limits
 
 
 @dataclass(frozen=True)
@@ -415,7 +415,6 @@ class ArmWatch:
     readings that count. silent: (n,) whether a motor is.
     fault: what the newest readings show, or None. is_late: whether a motor has not replied to some commands.
     trusted: whether zeros and signs were proven, and the angles have been continuous since.
-    pause_damping: Nm s/rad, after a pause of the loop; it falls to 0.
     is_being_proven: whether the arm was seen to hang and its signs are being proven, set from outside: the angles must
     be continuous from then on.
     """
@@ -433,7 +432,6 @@ class ArmWatch:
         self.rest = RestTracker(count)
         self._timeout, self._longest = limits.reply_timeout, period + STALL.late
         self._now, self._ran = -math.inf, 0.0  # s, of the last cycle, and for which the loop has run
-        self.pause_damping = 0.0
         self._last = self._resumed = math.inf  # s, of the last command, and of the first one after a pause
         self._before: Sequence[JointSample] = ()  # the readings before a pause, until the ones after it are judged
         self._held: Sequence[float] = ()  # Nm
@@ -500,18 +498,16 @@ class ArmWatch:
                 fault = Fault.of_joint(FaultCode.TORQUE_NOT_DELIVERED, joint.name, reason)
         return fault
 
-    def step_pause(self, now: float, dt: float, effort: Sequence[float], is_carried: bool) -> Fault | None:
-        """Damp a carried arm whose loop has stood still; return the fault that the readings after a pause show.
+    def judge_pause(self, now: float, effort: Sequence[float], is_carried: bool) -> Fault | None:
+        """Return the fault that the readings of a carried arm show after its loop has stood still.
 
         effort: (n,) Nm, of the last command.
         """
-        self.pause_damping = max(0.0, self.pause_damping - DAMPING_RATE * dt)
         gap, self._last = now - self._last, now if is_carried else math.inf
         if not is_carried:
             self._before = ()
         elif gap > self._longest:
             self._before, self._held, self._resumed, self._gap = self.samples, effort, now, gap
-            self.pause_damping = DAMPING
             return None
         if not self._before or not all(sample.time >= self._resumed for sample in self.samples):
             return None
