@@ -110,7 +110,7 @@ def test_one_wrong_reading_is_no_fault_and_is_not_passed_on_and_two_are_a_fault(
 
 @pytest.mark.parametrize(("readings", "faults"), [(7, []), (9, ["over_speed"])])
 def test_a_slap_on_the_table_is_no_over_speed_and_a_joint_that_stays_fast_is(readings, faults):
-    assert Replies(rate=250.0).run(3).run(readings, velocity=7.0).faults == faults  # rad/s, the limit is 5
+    assert Replies(rate=250.0).run(3).run(readings, velocity=7.0).faults == faults  # rad/s, the usual limit is 5
 
 
 def test_a_joint_outside_its_limits_is_a_fault():

@@ -143,7 +143,7 @@ class FaultCode(str, Enum):
     TORQUE_NOT_DELIVERED = "torque_not_delivered", "a motor's reply shows another torque than commanded", RECHECK
     TORQUE_DIPPED = "torque_dipped", "a joint fell while the loop stood still: its motor's time-out is too short"
     # The motion
-    OVER_SPEED = "over_speed", "a joint turns faster than 5 rad/s, the elbow 6"
+    OVER_SPEED = "over_speed", "a joint turns faster than `max_velocity`"
     OUTSIDE_LIMITS = "outside_limits", "a joint is over 0.1 rad beyond `position_min` or `position_max`"
     POSITION_JUMP = "position_jump", "an angle changed by 0.05 rad more than `over_speed` allows"
     READINGS_CONTRADICT = (

@@ -65,6 +65,7 @@ class Derating:
 class ReadingLimits:
     """Which readings of a motor are plausible, and when it is silent."""
 
+    fastest: Sequence[float] = (5.0, 5.0, 5.0, 6.0)  #: rad/s, the usual `max_velocity`
     shock: float = 0.03  #: s above `max_velocity`, by half of it at most, that a slap on a table lasts
     overshoot: float = 0.1  #: rad past a joint limit: mechanical stops are not infinitely stiff
     missed: int = 7  #: commands without a reply; with 3 % lost each way an arm misses so many once in 270 h at 100 Hz
@@ -94,8 +95,10 @@ class Limits:
     joint_names: tuple[str, ...]
     position_min: Sequence[float] = owned((-1.65, -0.17, -0.78, -0.17), "lower joint limits", (-3.15, 3.15), "rad")
     position_max: Sequence[float] = owned((1.65, 3.14, 2.53, 3.14), "upper joint limits", (-3.15, 3.15), "rad")
-    #: rad/s that trips a fault; a reach stays below, a throw does not
-    max_velocity: Sequence[float] = (5.0, 5.0, 5.0, 6.0)
+    #: a reach stays below, a throw does not
+    max_velocity: Sequence[float] = owned(
+        (0.0,) * JOINT_COUNT, "speed beyond which a joint is a fault; 0: 5, the paper's elbow 6", (0.0, 20.0), "rad/s"
+    )
     max_effort: Sequence[float] = owned(
         tuple(MOTORS[name].rated_torque for name in USUAL_MOTORS),
         "torque limit, by default the motors' rated torque",
@@ -174,8 +177,10 @@ class Limits:
         if not 1 <= len(set(names)) == len(names) <= MAX_JOINTS or not all(names):
             raise ParameterError("joint_names", list(names), f"1 to {MAX_JOINTS} different names")
         check_owned(self, len(names))
-        for name in ("max_velocity", "home_tolerance", "max_command"):
+        for name in ("home_tolerance", "max_command"):
             object.__setattr__(self, name, for_joints(getattr(self, name), len(names)))
+        fastest = zip(self.max_velocity, for_joints(READING.fastest, len(names)), strict=True)
+        object.__setattr__(self, "max_velocity", tuple([own or usual for own, usual in fastest]))
         object.__setattr__(self, "channels", tuple(self.channels) or ("",) * len(names))
         self._check_directions()
         if any(high - low < 4 * WALL.width for low, high in zip(self.position_min, self.position_max, strict=True)):
@@ -189,21 +194,18 @@ class Limits:
     @property
     def axes(self) -> tuple[tuple[float, float, float], ...]:
         """Unit vectors (n, 3) along the joints' axes of an arm from a URDF, () for the paper's arm."""
-        return tuple(zip(self.axis_x, self.axis_y, self.axis_z, strict=True)) if self._has_axes else ()
+        axes = zip(self.axis_x, self.axis_y, self.axis_z, strict=True)
+        return tuple(axes) if any((*self.axis_x, *self.axis_y, *self.axis_z)) else ()
 
     @property
     def ways(self) -> tuple[tuple[float, float, float], ...]:
         """Unit vectors (n, 3) along its links, zeros for one without length."""
         return tuple(zip(self.link_x, self.link_y, self.link_z, strict=True))
 
-    @property
-    def _has_axes(self) -> bool:
-        return any((*self.axis_x, *self.axis_y, *self.axis_z))
-
     def _check_directions(self) -> None:
         """Check axes and links, which `largest_moment` of any arm but the paper's needs. Raises ParameterError."""
         moments, names = list(self.largest_moment), self.joint_names
-        if not self._has_axes:
+        if not self.axes:
             if any(moments) and len(names) != JOINT_COUNT:
                 expected = "zeros without axis_x, axis_y, axis_z, which `budget` prints for arms but the paper's"
                 raise ParameterError("largest_moment", moments, expected)
@@ -258,8 +260,7 @@ def check_bridge(rate: float, motors: Sequence[JointMotor], limits: Limits, buse
 
     buses: the traffic on each of its buses. Raises ParameterError that names both values.
     """
-    timeouts = {name: getattr(limits, name) for name in ("command_timeout", "frozen_timeout")}
-    name, shortest = min(timeouts.items(), key=lambda item: item[1])
+    shortest, name = min((getattr(limits, name), name) for name in LONGEST)
     if rate * shortest < PERIODS - 1e-9:
         expected = f"at least {PERIODS / shortest:g} Hz: {name} = {shortest:g} s must span {PERIODS} periods"
         raise ParameterError("rate", rate, expected)
@@ -267,11 +268,10 @@ def check_bridge(rate: float, motors: Sequence[JointMotor], limits: Limits, buse
     if rate > REPLY_SHARE * status_rate + 1e-9 and not all(motor.wire_format.replies for motor in motors):
         expected = f"at most {REPLY_SHARE * status_rate:g} Hz: each cycle waits for a status frame of a V3 board"
         raise ParameterError("rate", rate, f"{expected}, which sends {status_rate:g} a second")
-    peak = [motor.peak_effort for motor in motors]
     if not all(limits.max_effort):
         raise ParameterError("max_effort", list(limits.max_effort), "above 0 Nm: else nothing carries the arm")
-    if any(effort > most + 1e-9 for effort, most in zip(limits.max_effort, peak, strict=True)):
-        shown = [round(effort, 2) for effort in peak]
-        raise ParameterError("max_effort", list(limits.max_effort), f"at most the motors' peak torque, {shown} Nm")
+    peak = [round(motor.peak_effort, 2) for motor in motors]
+    if any(effort > most + 0.005 for effort, most in zip(limits.max_effort, peak, strict=True)):
+        raise ParameterError("max_effort", list(limits.max_effort), f"at most the motors' peak torque, {peak} Nm")
     for bus in buses:
         bus.check(rate)
