@@ -9,7 +9,8 @@ import itertools
 import math
 from collections.abc import Callable, Sequence
 from functools import lru_cache, partial
-from typing import NamedTuple
+from types import ModuleType
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -29,18 +30,20 @@ class LinkFrame(NamedTuple):
     across: Floats3  #: the axis of the next joint
 
 
-def frames(length: Sequence[float], theta: Sequence[float]) -> tuple[LinkFrame, LinkFrame, LinkFrame, LinkFrame]:
-    """Return the four links of `length` (4,) m at `theta` (4,) rad."""
+def frames(
+    length: Sequence[float], theta: Sequence[Any], xp: ModuleType = math
+) -> tuple[LinkFrame, LinkFrame, LinkFrame, LinkFrame]:
+    """Return the four links of `length` (4,) m at `theta` (4,) rad; with NumPy as `xp` also (4, m), for m poses."""
     t1, t2, t3, t4 = theta
     l1, l2, l3, _ = length
-    s1, c1, s2, c2 = math.sin(t1), math.cos(t1), math.sin(t2), math.cos(t2)
+    s1, c1, s2, c2 = xp.sin(t1), xp.cos(t1), xp.sin(t2), xp.cos(t2)
     vertical = (0.0, 0.0, 1.0)
     first: Floats3 = (c1, s1, 0.0)
     swing: Floats3 = (-s1, c1, 0.0)  # the axis of joint 2
     second: Floats3 = (s2 * c1, s2 * s1, c2)
     bend: Floats3 = (-c2 * c1, -c2 * s1, s2)  # the axis of joints 3 and 4
-    third = plus(plus(ZERO, second, math.cos(t3)), swing, math.sin(t3))
-    fourth = plus(plus(ZERO, second, math.cos(t3 + t4)), swing, math.sin(t3 + t4))
+    third = plus(plus(ZERO, second, xp.cos(t3)), swing, xp.sin(t3))
+    fourth = plus(plus(ZERO, second, xp.cos(t3 + t4)), swing, xp.sin(t3 + t4))
     shoulder = plus(ZERO, first, l1)
     flexion = plus(shoulder, second, l2)
     elbow = plus(flexion, third, l3)

@@ -28,6 +28,7 @@ from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from copy import copy
 from dataclasses import dataclass, field, fields
 from functools import lru_cache
+from itertools import chain
 from types import ModuleType
 from typing import Any
 
@@ -269,8 +270,11 @@ class ArmModel:
 
         Frames are those of Table 1: a joint has that of the link before.
         """
-        each = [frames(self.length.tolist(), pose) for pose in theta.tolist()]
-        links = np.reshape(each, (-1, JOINT_COUNT, 5, 3))
+        at = (theta[0].tolist(), math) if len(theta) == 1 else (theta.T, np)  # plain floats are faster for one
+        numbers = np.empty((JOINT_COUNT * 15, len(theta)))
+        for row, value in zip(numbers, chain.from_iterable(chain(*frames(self.length.tolist(), *at))), strict=True):
+            row[:] = value
+        links = numbers.T.reshape(-1, JOINT_COUNT, 5, 3)
         after, base = np.swapaxes(links[:, :, 2:], 2, 3), np.broadcast_to(np.eye(3), (len(links), 1, 3, 3))
         hand = links[:, 3:, 0] + self.length[3] * links[:, 3:, 2]
         places = np.concatenate((links[:, :, 0], hand), axis=1)

@@ -378,24 +378,28 @@ def settings_of(
 
     urdf: the arm, for `law: urdf`. read: returns the text of the file `anfis_file`; without it the file is left out.
     """
-    robot: Arm
     if urdf is None and values["law"] == URDF_LAW:
         raise ParameterError("law", URDF_LAW, "chosen at the start, with an arm from a URDF")
-    if urdf is None:
-        robot, own = _papers(values)
-    else:
-        robot, own = urdf.scaled(values["gain"], values["gravity"]), _of_urdf(values, urdf)
+    robot: Arm = urdf.scaled(values["gain"], values["gravity"]) if urdf else robot_of(values)
+    with named("robot."):
+        by_mass = None if urdf else ArmModel(values["link_length"], values["robot.cog"], values["robot.mass"])
     mass, cog = wearer_of(values, robot.length)
+    along = values.get("wearer.first_moment", ())
+    worn = (along, values["wearer.off_axis"]) if along else zip(*(values[name] for name in WORN_MOMENTS), strict=True)
+    moments = tuple(map(tuple, worn))
     errors: list[Any] = [values.get(param.name, param.default) for param in MODEL_PARAMETERS]
     sized: list[Any] = [for_joints(error, len(mass), max) if isinstance(error, Sequence) else error for error in errors]
-    shared = {param.name: values[param.name] for param in params_of(Settings)}
+    own = {param.name: values[param.name] for param in params_of(Settings)}
+    limits = _limited(values, urdf.max_effort if urdf else values["max_effort"])
     path = values.get("anfis_file", "")
     try:
         return Settings(
             side=values.get("side", SIDES[0]),  # a URDF's root link is not mirrored
             robot=robot,
+            robot_by_mass=by_mass,
             wearer_mass=mass,
             wearer_cog=cog,
+            wearer_moments=moments if any(along or itertools.chain(*moments)) else (),
             use_imu=values["use_imu"],
             trained=read(path) if path and read else "",
             terms=term_settings_of(values, terms_of_others(values)),
@@ -403,30 +407,20 @@ def settings_of(
             joint_spring=joint_spring_of(values),
             tissue=Springs(values["wearer.joint_stiffness"], values["wearer.joint_rest"], TISSUE_REACH),
             payload=Payload(values["payload.mass"], tuple(values["payload.cog"])),
-            **{**shared, **own},
+            **{**own, "max_effort": limits},
         )
     except (OSError, UnicodeDecodeError, DataError) as error:
         raise ParameterError("anfis_file", path, f"a file from train_anfis ({error})") from None
 
 
-def _papers(values: Mapping[str, Any]) -> tuple[ArmModel, dict[str, Any]]:
-    """Return the paper's arm, and what only its settings have."""
-    with named("robot."):
-        by_mass = ArmModel(values["link_length"], values["robot.cog"], values["robot.mass"])
-    moments = tuple(values["wearer.first_moment"]), tuple(values["wearer.off_axis"])
-    worn = {"wearer_moments": moments} if any(moments[0]) else {}
-    return robot_of(values), {"robot_by_mass": by_mass, **worn}
-
-
-def _of_urdf(values: Mapping[str, Any], urdf: UrdfModel) -> dict[str, Any]:
-    """Return what only the settings of an arm from a URDF have. Raises ParameterError where an effort has no limit."""
-    limits = tuple(given or own for given, own in zip(values["max_effort"], urdf.max_effort, strict=True))
+def _limited(values: Mapping[str, Any], most: Sequence[float]) -> tuple[float, ...]:
+    """Return `max_effort` (n,) Nm, `most` where it is 0. Raises ParameterError where neither has a limit."""
+    limits = tuple(given or own for given, own in zip(values["max_effort"], most, strict=True))
     for name, limit in zip(values["joint_names"], limits, strict=True):
         if not limit:
             expected = "greater than 0, because the URDF has no usable effort limit"
             raise ParameterError(f"max_effort of {name}", limit, expected)
-    moments = tuple(zip(*(values[name] for name in WORN_MOMENTS), strict=True))
-    return {"max_effort": limits, **({"wearer_moments": moments} if any(map(any, moments)) else {})}
+    return limits
 
 
 def joint_spring_of(values: Mapping[str, Any]) -> Springs:

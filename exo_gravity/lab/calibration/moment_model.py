@@ -33,6 +33,7 @@ STEP = 10.0  # deg, of their angles
 FITTED = 60  # poses in which the moments of an arm are found from its torque
 DEPENDENT = 1e-6  # of the largest column: what is left of one that depends on others
 LITTLE = 1e-6  # Nm per kg m: a joint that carries less carries nothing
+TURN = np.cross(np.eye(3), np.eye(3)[:, None])  # (3, 3, 3): v @ TURN has the rows v x X, v x Y and v x Z
 MOMENT_PARAMETERS = {"robot.first_moment": slice(JOINT_COUNT), "robot.off_axis": slice(JOINT_COUNT, None)}
 
 Base = Sequence[tuple[int, np.ndarray]]  # of each moment the link's number, and a unit vector (3,) in its frame
@@ -130,17 +131,20 @@ class MomentModel:
 
     def along_axes(self, theta: np.ndarray) -> np.ndarray:
         """Return the torque (m, n, k, 3) in Nm per kg m with gravity along each axis of the base, at `theta` (m, n)."""
-        link, _ = self._columns
         axes, _, moments = self._turned(theta)
-        cross = np.cross(axes[:, :, None], moments[:, None])
-        return np.asarray(-self.gravity * cross * self.moved_by[:, link, None])
+        pulls = -moments[:, None] @ TURN  # (m, 3, k, 3), each axis of the base x moment
+        return np.moveaxis(axes[:, None] @ np.swapaxes(pulls, 2, 3) * self._carried, 1, -1)
 
     def rows(self, theta: np.ndarray, direction: np.ndarray) -> np.ndarray:
         """Return the torque (m, n, k) in Nm per kg m at `theta` (m, n) rad. direction: (3,) or (m, 3)."""
-        link, _ = self._columns
         axes, _, moments = self._turned(theta)
-        pulls = np.cross(np.reshape(direction, (-1, 1, 3)), moments)
-        return np.asarray(self.gravity * (axes @ np.swapaxes(pulls, 1, 2)) * self.moved_by[:, link])
+        pulls = moments @ np.swapaxes(direction @ TURN, 0, -2)  # (m, k, 3), direction x moment
+        return np.asarray(axes @ np.swapaxes(pulls, 1, 2) * self._carried)
+
+    @cached_property
+    def _carried(self) -> np.ndarray:
+        """Gravity in m/s^2 where a joint carries a moment, 0 elsewhere, (n, k)."""
+        return np.asarray(self.gravity * self.moved_by[:, self._columns[0]])
 
     @cached_property
     def _columns(self) -> tuple[np.ndarray, np.ndarray]:
@@ -152,8 +156,8 @@ class MomentModel:
         """Return axes (m, n, 3), turns (m, n, 3, 3) and directions of the moments (m, k, 3) in the base's axes."""
         frames, (link, ways) = self.arm.frames(theta), self._columns
         turns = self.turns @ np.swapaxes(frames.before, 2, 3)
-        moments = np.einsum("mkab,kb->mka", frames.after[:, link], ways)
-        return turns[:, :, 0], turns, moments
+        moments = frames.after[:, link] @ ways[..., None]
+        return turns[:, :, 0], turns, moments[..., 0]
 
     @cached_property
     def upright(self) -> np.ndarray:
@@ -208,10 +212,12 @@ class MomentModel:
         """
         return {name: moments[part] for name, part in MOMENT_PARAMETERS.items()}
 
-    def worn(self, moments: np.ndarray) -> Arm:
-        """Return the arm with a wearer who adds `moments` (k,) kg m."""
-        along, across = (self.moments + moments).reshape(2, -1)
-        return ArmModel.from_moments(self.arm.length, along, across, gravity=self.gravity)
+    def holding(self, moments: np.ndarray) -> Arm:
+        """Return the arm with any `moments` (k,) kg m in place of its own, for the torque and the skeleton."""
+        arm = copy(self.arm)
+        for name, part in zip(("first_moment", "off_axis"), moments.reshape(2, -1).tolist(), strict=True):
+            object.__setattr__(arm, name, tuple(part))  # not within the bounds of a file, which a guess may leave
+        return arm
 
     def worn_in_file(self, moments: np.ndarray) -> dict[str, np.ndarray]:
         """Return the compensator's parameters, (n,) each, that hold what a wearer adds to the moments, (k,) kg m."""
@@ -316,9 +322,9 @@ class DescribedModel(MomentModel):
         new = self.found(self.arm, moments, turn)
         return dict(zip((*MOMENT_NAMES, *TURN_NAMES), (*new.change.T, *new.turn.T), strict=True))
 
-    def worn(self, moments: np.ndarray) -> Arm:
-        """Return the arm with a wearer who adds `moments` (k,) kg m."""
-        return self.arm.with_wearer_moments(self.in_links(moments))
+    def holding(self, moments: np.ndarray) -> Arm:
+        """Return the arm with any `moments` (k,) kg m in place of its own."""
+        return self.arm.corrected(self.arm.change + self.in_links(moments - self.moments))
 
     def worn_in_file(self, moments: np.ndarray) -> dict[str, np.ndarray]:
         """Return the same along x, y and z of the links."""

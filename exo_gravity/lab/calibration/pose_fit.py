@@ -26,10 +26,9 @@ from typing import NamedTuple
 import numpy as np
 
 from exo_gravity.core.errors import DataError
-from exo_gravity.lab.calibration.moment_model import TURNS, MomentModel
+from exo_gravity.lab.calibration.moment_model import TURN, TURNS, MomentModel
 from exo_gravity.lab.calibration.tracking import Observation
 
-TURN = np.cross(np.eye(3), np.eye(3)[:, None])  # (3, 3, 3): v @ TURN has the rows v x X, v x Y and v x Z
 # kg m, logarithm, Nm, rad, rad, Nm/rad, 1/K, rad: a combination of unknowns that may be wrong by this much is not
 # known.
 NATURAL = (0.1, 0.3, 0.3, 0.3, 0.1, 0.1, 0.005, 0.1)

@@ -102,8 +102,7 @@ class TorqueGuess:
 
     def torque(self, theta: Sequence[float]) -> Torque:
         """Return the expected torque (n,) in Nm at `theta` (n,) rad, in plain floats for the control loop."""
-        rows = self.model.rows(np.array([theta]), self.tilt.magnitude * self.model.down(self.tilt))[0]
-        gravity = np.einsum("nk,nk->n", rows, self._moments).tolist()
+        gravity = [arm.torque(theta, self.tilt)[joint] for joint, arm in enumerate(self._arms)]
         return tuple(own + at + k * angle for own, (at, k), angle in zip(gravity, self._springs, theta, strict=True))
 
     def torques(self, theta: np.ndarray, direction: Vector | None = None) -> tuple[np.ndarray, np.ndarray]:
@@ -155,6 +154,7 @@ class TorqueGuess:
     def _update(self) -> None:
         """Take over the mean."""
         self._springs = self._mean[:, -2:].tolist()
+        self._arms = [self.model.holding(moments) for moments in self._moments]  # each for the torque of one joint
         now = np.einsum("njk,jk->nj", self._rows, self._moments)
         least = len(self._rows) * PRIOR.unexplained**2  # of a joint that carries nothing
         strength = (np.sum(now * self._at_start, axis=0) + least) / (np.sum(self._at_start**2, axis=0) + least)

@@ -134,7 +134,7 @@ class WornArm:
 
     def allowed(self, moments: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return `largest_moment`, (n,) kg m, and the torque of what lies beside the links, (n,) Nm."""
-        skeleton = self.model.worn(moments).skeleton()
+        skeleton = self.model.holding(self.model.moments + moments).skeleton()
         if skeleton is None:
             return np.zeros(self.model.count), np.zeros(self.model.count)
         return skeleton.moments, self.model.gravity * skeleton.beside

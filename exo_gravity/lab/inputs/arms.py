@@ -5,7 +5,7 @@ An arm is a namespace with a `can_bridge` and a `compensator`. Both are checked 
 unknown parameter is an error here too. Errors name node and parameter: `/right/can_bridge position_min`.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -87,12 +87,14 @@ class ConfiguredArm:
             return settings_from(self.compensator)
 
 
-def settings_from(values: Mapping[str, Any], why: str = "") -> Settings:
+def settings_from(values: Mapping[str, Any], why: str = "", read: Callable[[str], str] | None = read_model) -> Settings:
     """Return the settings that a compensator's parameter values describe, with the files that they name.
+
+    read: of the model of a law; None to leave it out. With `law: exact` any arm has its own torque.
 
     Raises ParameterError, also if a URDF comes from a topic; why: ends the sentence that it must be a file.
     """
-    return settings_of(values, arm_in_file(values, why) if values["law"] == URDF_LAW else None, read_model)
+    return settings_of(values, arm_in_file(values, why) if "urdf.file" in values else None, read)
 
 
 def read_arm(nodes: Nodes, namespace: str) -> ConfiguredArm:
@@ -112,10 +114,8 @@ def read_arm(nodes: Nodes, namespace: str) -> ConfiguredArm:
     with named(f"{namespace}/can_bridge "):
         motors, limits = motors_of(can_bridge), limits_of(can_bridge)
     with named(f"{node} "):
-        if given.get("law") == URDF_LAW:
-            robot = settings_from(compensator).robot
-        else:  # the robot does not depend on the law, and the model of `law: anfis` may not be trained yet
-            robot = settings_of({**compensator, "law": "exact"}).robot
+        # The robot does not depend on the law, and the model of `law: anfis` may not be trained yet.
+        robot = settings_from({**compensator, "law": "exact"}, read=None).robot
     return ConfiguredArm(namespace, can_bridge, compensator, motors, limits, robot)
 
 

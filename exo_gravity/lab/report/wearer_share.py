@@ -14,7 +14,6 @@ import numpy as np
 
 from exo_gravity.core.arm.rotation import ZERO, Floats3
 from exo_gravity.core.arm.tilt import Tilt, turning_in_base
-from exo_gravity.core.compensation.laws import URDF_LAW
 from exo_gravity.core.errors import DataError
 from exo_gravity.core.numbers import COVER
 from exo_gravity.core.vocabulary import Source
@@ -39,9 +38,8 @@ def of_arm(bag: Bag, recording: Recording) -> WearerPart | None:
     Raises ParameterError or DataError that says why it is not known.
     """
     values = recorded_of(bag.parameters, recording.name, "compensator")
-    law = URDF_LAW if values.get("law") == URDF_LAW else "exact"
     why = ": the URDF came from a topic, which is not recorded"
-    settings = settings_from({**values, "law": law}, why) if values else None
+    settings = settings_from({**values, "law": "exact"}, why) if values else None
     if settings is None or not any(settings.wearer_mass):
         return None  # without a wearer in the model, the weight of their arm would count as their torque
     times, rows = bag.trunk[:, 0].tolist(), bag.trunk[:, 1:].tolist()
