@@ -200,7 +200,11 @@ class UrdfShape:
     """
 
     def __init__(self, text: str, joint_names: Sequence[str], hand: str) -> None:
-        self._pin, names = _pinocchio(), list(joint_names)
+        try:
+            import pinocchio
+        except ImportError:
+            raise ParameterError("law", "urdf", f"used with Pinocchio: {pip_install('pin')}") from None
+        self._pin, names = pinocchio, list(joint_names)
         if not 1 <= len(set(names)) == len(names) <= MAX_JOINTS:
             raise ParameterError("joint_names", names, f"1 to {MAX_JOINTS} different joints of the URDF")
         self.moves = UrdfJoints(self._pin, text, names)  # shared by all arms that are made of this one
@@ -238,13 +242,6 @@ class UrdfShape:
         pin.computeJointJacobians(model, data, pin.neutral(model))
         jacobians = ((n, pin.getJointJacobian(model, data, n, pin.ReferenceFrame.LOCAL)) for n in self._joints)
         return np.array([np.reshape(own, (6, -1))[3:, model.joints[n].idx_v] for n, own in jacobians])
-
-    @property
-    def masses(self) -> np.ndarray:
-        """What each joint (n,) moves, in kg: its link, all beyond it, and what the arm holds."""
-        data = self._model.createData()
-        self._pin.computeSubtreeMasses(self._model, data)
-        return np.array([data.mass[joint] for joint in self._joints])
 
     @cached_property
     def turns(self) -> np.ndarray:
@@ -297,7 +294,10 @@ class UrdfShape:
             return None
         turns, ways = self.frames(np.zeros((1, len(self._joints)))).after[0], self.directions
         links = [self._model.inertias[joint] for joint in self._joints]
-        beyond = np.multiply(self.length, self.masses - [link.mass for link in links])
+        moved = self._model.createData()  # kg that each joint moves: its link, all beyond it, and what the arm holds
+        self._pin.computeSubtreeMasses(self._model, moved)
+        more = [moved.mass[joint] - link.mass for joint, link in zip(self._joints, links, strict=True)]
+        beyond = np.multiply(self.length, more)
         own = np.array([link.mass * link.lever for link in links]) + beyond[:, None] * ways
         moments = np.maximum(np.einsum("na,na->n", own, ways), 0.0)
         beside = np.linalg.norm(own - moments[:, None] * ways, axis=1)
@@ -325,11 +325,3 @@ class UrdfShape:
             ends = following if len(following) == 1 else [place for carrier, place in hands if carrier == joint]
             way[:] = sum(end.translation for end in ends)
         return ways
-
-
-def _pinocchio() -> Any:
-    try:
-        import pinocchio
-    except ImportError:
-        raise ParameterError("law", "urdf", f"used with Pinocchio: {pip_install('pin')}") from None
-    return pinocchio

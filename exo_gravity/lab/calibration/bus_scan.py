@@ -27,7 +27,7 @@ import can
 from exo_gravity.core.errors import BusError
 from exo_gravity.core.motors.ak import FAMILY, MIT
 from exo_gravity.core.motors.families import FAMILIES, MOTORS, every_family
-from exo_gravity.core.motors.frames import COMMAND, EXTENDED, OTHER, REPLY, Frame, WireFormat
+from exo_gravity.core.motors.frames import COMMAND, EXTENDED, OTHER, REPLY, WireFormat
 from exo_gravity.core.motors.joint_motor import MAX_CAN_ID, MAX_STATUS_RATE, is_fd
 from exo_gravity.hardware.bus_lock import BusLock
 from exo_gravity.hardware.can_port import Address, CanPort, open_bus
@@ -227,25 +227,18 @@ class BusScan(contextlib.ExitStack):
 
     def _sort(self, message: can.Message, asked: WireFormat | None) -> tuple[str, MotorAnswer | None]:
         """Return what a frame is, and the answer in it; `asked` as for `_frames`."""
-        frame = message.arbitration_id, bytes(message.data)
-        kinds = set()
+        data, kinds = bytes(message.data), set()
         for board in dict.fromkeys((*([asked] if asked else ()), *self._reporting, *self._asked)):
             ids = IDS if board in self._reporting else dict.fromkeys(range(1, board.last_id + 1), 0)
             frame_id = message.arbitration_id | (EXTENDED if message.is_extended_id else 0)
             kind, can_id = board.classify(frame_id, message.data, ids)
             if kind == REPLY and (board in (asked, *self._reporting) or self._boards.get(can_id) is board):
-                answer = _answer(board, can_id, frame)
+                reply = board.unpack_reply(SPEC, can_id, data)
+                state = reply.position, reply.temperature, reply.error
+                answer = MotorAnswer(can_id, message.arbitration_id, len(data), *state, board.name, board.family)
                 self._boards[can_id] = board
                 if board in self._reporting:
                     self._v3[can_id] = answer
                 return kind, answer
             kinds.add(kind)
         return (COMMAND if COMMAND in kinds else OTHER), None
-
-
-def _answer(board: WireFormat, can_id: int, frame: Frame) -> MotorAnswer:
-    """Return what a reply says."""
-    reply_id, data = frame
-    reply = board.unpack_reply(SPEC, can_id, data)
-    state = reply.position, reply.temperature, reply.error
-    return MotorAnswer(can_id, reply_id, len(data), *state, board.name, board.family)

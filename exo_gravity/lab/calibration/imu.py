@@ -117,16 +117,11 @@ def calibrate_imu(options: argparse.Namespace, arm: ConfiguredArm | None, say: S
     bows = f"from {found.bows} {'bow' if found.bows == 1 else 'bows'} of up to {math.degrees(found.bow):.0f} degrees"
     changes = [Change(NODE, ROTATION, quaternion, f"{accuracy}, {bows}")]
     if options.rests:
-        *rows, remainder = six_rests(read_imu(options.rests, topic))
+        *rows, remainder = six_rests(record_of(read_samples(options.rests, topic)))
         scale, bias = (" ".join(f"{value:.4f}" for value in row) for row in rows)
         fit = f"true = scale (shown - bias), scale {scale}, bias {bias} m/s^2, for the driver"
         changes.append(Change(NODE, "", 0, f"accelerometer: {fit}; {remainder:.3f} m/s^2 remain"))
     return CalibrationResult(tuple(changes))
-
-
-def read_imu(bag: Path, topic: str) -> ImuRecord:
-    """Return the samples of `topic` in a recording, in order of their stamps. Raises DataError."""
-    return record_of(read_samples(bag, topic))
 
 
 def read_samples(bag: Path, topic: str) -> list[ImuSample]:

@@ -67,29 +67,6 @@ PAPERS = Kind(
 )
 
 
-def turned_by(
-    axes: np.ndarray, turns: np.ndarray, moments: np.ndarray, link: np.ndarray, moved_by: np.ndarray
-) -> np.ndarray:
-    """Return the derivative (m, n, k, 3, 3 n) of `along_axes` per m/s^2 of gravity by turns of the joints' places.
-
-    axes: (m, n, 3), of the joints. turns: (m, n, 3, 3), of each joint the three directions about which its place turns.
-    moments: (m, k, 3), directions of the moments. All in the base frame. link: (k,), that has each moment. moved_by:
-    (n, n), whether a joint moves the link of another.
-
-    A moment v loads the joint with axis a by -(a x v) . gravity. A turn w of joint j turns all that j moves, except the
-    moment along its axis, which counts as one of the link before: a fit takes what is missing for moments of that link.
-    """
-    moved = moved_by[:, link]  # (n, k)
-    cross = np.cross(axes[:, :, None], moments[:, None]) * moved[..., None]  # (m, n, k, 3)
-    # By joint j and its turn t: (m, n, k, j, t, 3)
-    both = np.cross(turns[:, None, None], cross[:, :, :, None, None])
-    swept = np.cross(turns[:, None], moments[:, :, None, None])  # (m, k, j, t, 3)
-    alone = np.cross(axes[:, :, None, None, None], swept[:, None]) * moved[..., None, None, None]
-    with_axis, with_link = moved_by.T[:, None, :, None, None], moved.T[:, :, None, None]
-    change = -np.where(with_axis, both, alone) * with_link
-    return np.moveaxis(change, -1, 3).reshape(*cross.shape, -1)
-
-
 class MomentModel:
     """The paper's arm, whose moments are unknown; `DescribedModel` is another one.
 
@@ -201,9 +178,22 @@ class MomentModel:
         return np.asarray(mass * lever * (across @ self._on_last[1:]).T)
 
     def turned(self, theta: np.ndarray) -> np.ndarray:
-        """Return the derivative (m, n, k, 3, 3 n) of `along_axes` by turns of the joints' places."""
-        link, _ = self._columns
-        return self.gravity * turned_by(*self._turned(theta), link, self.moved_by)
+        """Return the derivative (m, n, k, 3, 3 n) of `along_axes` by turns of the joints' places.
+
+        A moment v loads the joint with axis a by -(a x v) . gravity. A turn w of joint j turns all that j moves, except
+        the moment along its axis, which counts as one of the link before: a fit takes what is missing for moments of
+        that link.
+        """
+        axes, turns, moments = self._turned(theta)
+        moved = self.moved_by[:, self._columns[0]]  # (n, k)
+        cross = np.cross(axes[:, :, None], moments[:, None]) * moved[..., None]  # (m, n, k, 3)
+        # By joint j and its turn t: (m, n, k, j, t, 3)
+        both = np.cross(turns[:, None, None], cross[:, :, :, None, None])
+        swept = np.cross(turns[:, None], moments[:, :, None, None])  # (m, k, j, t, 3)
+        alone = np.cross(axes[:, :, None, None, None], swept[:, None]) * moved[..., None, None, None]
+        with_axis, with_link = self.moved_by.T[:, None, :, None, None], moved.T[:, :, None, None]
+        change = -self.gravity * np.where(with_axis, both, alone) * with_link
+        return np.moveaxis(change, -1, 3).reshape(*cross.shape, -1)
 
     def in_file(self, moments: np.ndarray, turn: np.ndarray) -> dict[str, np.ndarray]:
         """Return the compensator's parameters, (n,) each, that hold `moments` (k,) kg m as a fit found them.
@@ -222,10 +212,6 @@ class MomentModel:
     def worn_in_file(self, moments: np.ndarray) -> dict[str, np.ndarray]:
         """Return the compensator's parameters, (n,) each, that hold what a wearer adds to the moments, (k,) kg m."""
         return {"wearer.first_moment": moments[:JOINT_COUNT], "wearer.off_axis": moments[JOINT_COUNT:]}
-
-    def common(self, moments: np.ndarray) -> np.ndarray:
-        """Return what the joint shows that carries the moment with its own link."""
-        return np.array([moments[n, k] for k, (n, _) in enumerate(self.base)])
 
     def matrix(self, theta: Sequence[float], load: tuple[float, float]) -> np.ndarray:
         """Return the mass matrix (n, n) in kg m^2 of the arm as far as known, with the load as a point."""

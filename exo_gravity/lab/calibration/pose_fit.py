@@ -164,6 +164,7 @@ class Rows(NamedTuple):
         angles, moments = rows @ self.beside, self._moments(unknowns)
         turns = np.einsum("mi,ita->mta", self.direction, TURN)
         tilted = np.einsum("mnka,mta,mk->mnt", self.along, turns, moments, optimize=True)
+        by_turns = np.einsum("mnkat,ma,mk->mnt", self.turned, self.direction, moments, optimize=True)
         warming = self.warmth / (1.0 + unknowns[at.slope] * self.warmth)
         parts = (
             rows * given[..., None],
@@ -173,15 +174,9 @@ class Rows(NamedTuple):
             tilted * given[..., None],
             own * (self.theta * given)[..., None],
             -own * (effort * warming)[..., None],
-            self.by_turns(self.turned, unknowns),
+            by_turns * given[..., None],
         )
         return np.concatenate(parts, axis=-1)
-
-    def by_turns(self, turned: np.ndarray, unknowns: np.ndarray) -> np.ndarray:
-        """Return the derivative (m, n, t) of `predicted` by turns, by which `along` has the derivative `turned`."""
-        _, _, given = self._parts(unknowns)
-        torque = np.einsum("mnkat,ma,mk->mnt", turned, self.direction, self._moments(unknowns), optimize=True)
-        return np.asarray(torque * given[..., None])
 
     def _moments(self, unknowns: np.ndarray) -> np.ndarray:
         """Return the moments of arm and weight, (m, k) kg m."""

@@ -98,7 +98,7 @@ class TorqueGuess:
     @property
     def common_moments(self) -> np.ndarray:
         """The moments (k,) in kg m as the joints show them that carry them with their own links."""
-        return self.model.common(self._moments)
+        return np.array([self._moments[n, k] for k, (n, _) in enumerate(self.model.base)])
 
     def torque(self, theta: Sequence[float]) -> Torque:
         """Return the expected torque (n,) in Nm at `theta` (n,) rad, in plain floats for the control loop."""

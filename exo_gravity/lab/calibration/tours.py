@@ -109,16 +109,11 @@ def calibrate_scale(options: argparse.Namespace, arm: ConfiguredArm, say: Say) -
         needed = _needed(arm, model, bare)
         bare = [one._replace(effort=effort) for one, effort in zip(bare, needed, strict=True)]
     else:
-        hang = _request(arm, mass, lever)
+        where = f"on the last link, {lever:g} m from {arm.joint_names[-1]}, on the way to the hand"
+        hang = f"Hang {mass:g} kg {where}" + (f". {LEAN}" if arm.compensator["use_imu"] else "")
         changes = {**poses, "tour.load_mass": mass, "tour.load_lever": lever, **_knowing(options.record)}
         weighed = tour_observations(options, arm, say, changes, hang)
     return moments_from(arm, earlier + bare + weighed, places)
-
-
-def _request(arm: ConfiguredArm, mass: float, lever: float) -> str:
-    """Return what a person is asked to hang on the arm."""
-    where = f"on the last link, {lever:g} m from {arm.joint_names[-1]}, on the way to the hand"
-    return f"Hang {mass:g} kg {where}" + (f". {LEAN}" if arm.compensator["use_imu"] else "")
 
 
 def model_of(arm: ConfiguredArm) -> MomentModel:

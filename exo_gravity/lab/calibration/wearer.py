@@ -110,11 +110,13 @@ def wearer_from(
 def _spring_changes(arm: ConfiguredArm, fit: WearerFit, unsure: np.ndarray, carried: float) -> tuple[Change, ...]:
     """Return the new springs, and how unsure the wearer is; unsure: standard error (n,) in Nm of their torque."""
     node, stiffness_error = f"{arm.namespace}/compensator", fit.stiffness_error
+    # Any share up to `carried` is as likely to be held unseen. Two of these errors cover 95 % of them.
+    unseen = 0.95 * carried / (1.0 - 0.95 * carried) / COVER
     return (
         Change(node, "wearer.joint_stiffness", fit.stiffness.round(3).tolist(), f"Nm/rad, +-{row(stiffness_error)}"),
         Change(node, "wearer.joint_rest", fit.rest.round(3).tolist(), "rad"),
         Change(node, "model_error.wearer_torque", unsure.round(3).tolist(), "Nm, of the wearer's passive arm"),
-        Change(node, "model_error.wearer", round(unseen_error(carried), 3), "share that the wearer may have held"),
+        Change(node, "model_error.wearer", round(unseen, 3), "share that the wearer may have held"),
     )
 
 
@@ -132,12 +134,3 @@ def _bridge_line(arm: ConfiguredArm, worn: WornArm, moments: np.ndarray, fit: We
     return (
         f"can_bridge, for this wearer at support 1: largest_moment [{values}] kg m, largest_addition {more} Nm or more"
     )
-
-
-def unseen_error(carried: float) -> float:
-    """Return the standard error of the weight, as a share of what was found, if up to `carried` (0..1) was held.
-
-    Any share up to that is as likely. Two of these errors cover 95 % of them.
-    """
-    usual = 0.95 * carried
-    return usual / (1.0 - usual) / COVER
