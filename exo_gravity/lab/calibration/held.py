@@ -72,7 +72,8 @@ def held(
     kept[at.moment] = moments
     jacobian = scale[:, None] * new.jacobian(unknowns)
     variance = np.einsum("qnt,tu,qnu->qn", jacobian, covariance, jacobian, optimize=True)
-    errors = left + np.sqrt(variance + (scale * misfit) ** 2) * NORMAL[:, None, None]
+    # Below 0 in some poses where a moment that no pose shows has its prior, but the fit's covariances with others.
+    errors = left + np.sqrt(np.maximum(variance, 0.0) + (scale * misfit) ** 2) * NORMAL[:, None, None]
     return InFile(kept, np.quantile(np.abs(errors), 0.95, axis=(0, 1)) / COVER)
 
 
