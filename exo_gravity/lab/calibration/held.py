@@ -48,6 +48,7 @@ def held(
     unknowns, covariance = unknowns.copy(), covariance.copy()
     for index in np.flatnonzero(~known):
         unknowns[index] = model.moments[index]
+        covariance[index] = covariance[:, index] = 0.0  # what the file has is not from this fit
         covariance[index, index] = (PRIOR.share * abs(model.moments[index]) + PRIOR.moment) ** 2
     new = _new_poses(model, rows.start)
     kept = unknowns.copy()
@@ -59,9 +60,8 @@ def held(
     left = scale * (new.predicted(unknowns) - new.predicted(kept))
     by_moments = scale[:, None] * new.jacobian(kept)[..., at.moment]
     while True:
-        matrix = by_moments[..., free].reshape(-1, len(free))
         moments = kept[at.moment].copy()
-        moments[free] += np.linalg.lstsq(matrix, left.ravel(), rcond=None)[0]
+        moments[free] += np.linalg.lstsq(by_moments[..., free].reshape(-1, len(free)), left.ravel(), rcond=None)[0]
         below = [index for index in free if index in model.kind.at_least_0 and moments[index] < 0.0]
         if not below:
             break
@@ -72,8 +72,7 @@ def held(
     kept[at.moment] = moments
     jacobian = scale[:, None] * new.jacobian(unknowns)
     variance = np.einsum("qnt,tu,qnu->qn", jacobian, covariance, jacobian, optimize=True)
-    # Below 0 in some poses where a moment that no pose shows has its prior, but the fit's covariances with others.
-    errors = left + np.sqrt(np.maximum(variance, 0.0) + (scale * misfit) ** 2) * NORMAL[:, None, None]
+    errors = left + np.sqrt(variance + (scale * misfit) ** 2) * NORMAL[:, None, None]
     return InFile(kept, np.quantile(np.abs(errors), 0.95, axis=(0, 1)) / COVER)
 
 
