@@ -176,7 +176,7 @@ class PlayedFiles:
         """Return what notes any other call with its words."""
 
         async def noted(**words: str) -> str:
-            return self._noted(" ".join((call, *words.values())))
+            return self._noted(" ".join((call, *(words[key] for key in sorted(words)))))
 
         return noted
 
