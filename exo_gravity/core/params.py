@@ -230,11 +230,16 @@ def installed(group: str) -> Mapping[str, Any]:
     return {entry.name: entry for entry in entry_points(group=group)}
 
 
-def loaded(group: str, name: str, what: str) -> Any:
-    """Return what the entry point `name` leads to. Raises KeyError, ParameterError that says `what` does not load."""
+def loaded(group: str, name: str, what: str, kind: type = object) -> Any:
+    """Return what the entry point `name` leads to, which must be a `kind`.
+
+    Raises KeyError, and ParameterError that says why `what` cannot be used.
+    """
     entry = installed(group)[name]
     try:
-        return entry.load()
+        if not isinstance(found := entry.load(), kind):
+            raise TypeError(f"it is no {kind.__name__}")
+        return found
     except Exception as error:  # the code of others
         expected = f"a {what} that can be loaded: {entry.value} of {group} ({error})"
         raise ParameterError(what, name, expected) from error

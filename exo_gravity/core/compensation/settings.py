@@ -390,7 +390,7 @@ def settings_of(
     errors: list[Any] = [values.get(param.name, param.default) for param in MODEL_PARAMETERS]
     sized: list[Any] = [for_joints(error, len(mass), max) if isinstance(error, Sequence) else error for error in errors]
     own = {param.name: values[param.name] for param in params_of(Settings)}
-    limits = _limited(values, urdf.max_effort if urdf else values["max_effort"])
+    limits = _limited(values, urdf.max_effort) if urdf else values["max_effort"]
     path = values.get("anfis_file", "")
     try:
         return Settings(
@@ -414,12 +414,13 @@ def settings_of(
 
 
 def _limited(values: Mapping[str, Any], most: Sequence[float]) -> tuple[float, ...]:
-    """Return `max_effort` (n,) Nm, `most` where it is 0. Raises ParameterError where neither has a limit."""
+    """Return `max_effort` (n,) Nm, the URDF's `most` where it is 0. Raises ParameterError where neither has a limit."""
     limits = tuple(given or own for given, own in zip(values["max_effort"], most, strict=True))
     for name, limit in zip(values["joint_names"], limits, strict=True):
         if not limit:
-            expected = "greater than 0, because the URDF has no usable effort limit"
-            raise ParameterError(f"max_effort of {name}", limit, expected)
+            raise ParameterError(
+                f"max_effort of {name}", limit, "greater than 0, because the URDF has no usable effort limit"
+            )
     return limits
 
 

@@ -61,11 +61,12 @@ def every_family() -> tuple[Family, ...]:
     """Return our own families, and those of other distributions. Raises ParameterError that names the entry point."""
     found = list(OURS)
     for name, entry in installed(GROUP).items():
-        family: Family = loaded(GROUP, name, "motor family")
+        family: Family = loaded(GROUP, name, "motor family", Family)
         known = {name for other in found for name in (other.name, *other.motors)}
         if taken := {family.name, *family.motors} & known:
-            expected = f"without {', '.join(sorted(taken))}, taken by another: {entry.value} of {GROUP}"
-            raise ParameterError("motor family", name, expected)
+            raise ParameterError(
+                "motor family", name, f"without {', '.join(sorted(taken))}, taken by another: {entry.value} of {GROUP}"
+            )
         found.append(family)
     return tuple(found)
 

@@ -270,8 +270,9 @@ def check_bridge(rate: float, motors: Sequence[JointMotor], limits: Limits, buse
         raise ParameterError("rate", rate, f"{expected}, which sends {status_rate:g} a second")
     if not all(limits.max_effort):
         raise ParameterError("max_effort", list(limits.max_effort), "above 0 Nm: else nothing carries the arm")
-    peak = [round(motor.peak_effort, 2) for motor in motors]
-    if any(effort > most + 0.005 for effort, most in zip(limits.max_effort, peak, strict=True)):
-        raise ParameterError("max_effort", list(limits.max_effort), f"at most the motors' peak torque, {peak} Nm")
+    peak = [motor.peak_effort for motor in motors]
+    if any(effort > most + 1e-9 for effort, most in zip(limits.max_effort, peak, strict=True)):
+        shown = [round(effort, 2) for effort in peak]
+        raise ParameterError("max_effort", list(limits.max_effort), f"at most the motors' peak torque, {shown} Nm")
     for bus in buses:
         bus.check(rate)

@@ -387,8 +387,8 @@ class SignCheck:
         while any(self.effort) or self._still_for[i] < SIGN_PUSH.still_time:
             self._take_back()
             waited += self._dt
-            fault = self._fault(i, "it does not come to rest: hold still and let it hang")
-            yield fault if waited > SIGN_PUSH.rest_timeout else None
+            is_late = waited > SIGN_PUSH.rest_timeout
+            yield self._fault(i, "it does not come to rest: hold still and let it hang") if is_late else None
 
     def _push(self, i: int, sign: float, most: float) -> Generator[Fault | None, None, bool]:
         """Return whether the joint moved under a push this way, False if it moved without one."""
@@ -413,8 +413,9 @@ class SignCheck:
         if waited < SIGN_PUSH.soonest:
             return False
         if moved < 0.0:
-            reason = f"{push:.2f} Nm moved it backwards: torque or encoder is reversed"
-            yield self._fault(i, reason, FaultCode.WRONG_SIGN)
+            yield self._fault(
+                i, f"{push:.2f} Nm moved it backwards: torque or encoder is reversed", FaultCode.WRONG_SIGN
+            )
         if not self.damped[i]:
             self._order.end(i, SIGN_PUSH.slow)
         self.damped[i] = True

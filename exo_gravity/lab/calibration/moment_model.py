@@ -203,7 +203,7 @@ class MomentModel:
         return {name: moments[part] for name, part in MOMENT_PARAMETERS.items()}
 
     def holding(self, moments: np.ndarray) -> Arm:
-        """Return the arm with any `moments` (k,) kg m in place of its own, for the torque and the skeleton."""
+        """Return a copy of the arm with these moments, (k,) kg m. Only its torque and skeleton are valid."""
         arm = copy(self.arm)
         for name, part in zip(("first_moment", "off_axis"), moments.reshape(2, -1).tolist(), strict=True):
             object.__setattr__(arm, name, tuple(part))  # not within the bounds of a file, which a guess may leave
@@ -309,7 +309,7 @@ class DescribedModel(MomentModel):
         return dict(zip((*MOMENT_NAMES, *TURN_NAMES), (*new.change.T, *new.turn.T), strict=True))
 
     def holding(self, moments: np.ndarray) -> Arm:
-        """Return the arm with any `moments` (k,) kg m in place of its own."""
+        """Return a copy of the arm with these moments, (k,) kg m."""
         return self.arm.corrected(self.arm.change + self.in_links(moments - self.moments))
 
     def worn_in_file(self, moments: np.ndarray) -> dict[str, np.ndarray]:
