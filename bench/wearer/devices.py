@@ -20,7 +20,7 @@ from exo_gravity.core.compensation.terms.catalogue import Friction
 from exo_gravity.core.compensation.terms.terms import TermSettings
 from exo_gravity.core.motors.joint_motor import JointMotor
 from exo_gravity.core.numbers import Vector
-from exo_gravity.lab.calibration.moment_model import PAPERS
+from exo_gravity.lab.calibration.moment_model import MomentModel
 from exo_gravity.lab.calibration.poses import candidates, hanging, next_pose
 from exo_gravity.lab.calibration.tracking import Observation
 from exo_gravity.lab.calibration.wearer import WEARER, wearer_from
@@ -73,7 +73,7 @@ class Worn:
 @cache
 def relaxed_poses() -> tuple[tuple[float, ...], ...]:
     """Return the poses of `calibrate wearer`, chosen as it does, the first ones again at the end."""
-    low, high = np.maximum(ARM.low, PAPERS.comfortable[0]), np.minimum(ARM.high, PAPERS.comfortable[1])
+    low, high = np.maximum(ARM.low, MomentModel.comfortable[0]), np.minimum(ARM.high, MomentModel.comfortable[1])
     limits = replace(ARM.limits, position_min=low.tolist(), position_max=high.tolist())
     poses, taken = candidates(limits, MODEL), [hanging(limits).theta]
     expected = ARM.paper_arm.with_wearer(*Wearer(sum(BODY_MASS) / 2.0).on_links(LENGTH)).moments

@@ -184,7 +184,7 @@ class UrdfArm(UrdfShape):
         self.max_effort = tuple(0.0 if name in unused else effort for name, effort in efforts)
 
     def __eq__(self, other: object) -> bool:
-        return isinstance(other, UrdfArm) and self._key == other._key
+        return self._key == getattr(other, "_key", None)
 
     def __hash__(self) -> int:
         return hash(self._key)

@@ -44,7 +44,6 @@ STARTS = 5  # poses from which the worst one is sought, because a search can end
 CHUNK = 2_000  # poses, about 1 ms of computation
 TOLERANCE = 1e-3  # Nm, or support; smaller differences are irrelevant to a motor
 STEPS = np.array(sorted(np.linspace(-1.0, 1.0, 21), key=abs))  # 0 comes first, so that the search stays put at a tie
-JOINTS = ("shoulder rotation", "shoulder abduction", "shoulder flexion", "elbow flexion")
 HEADINGS = (
     ("", "", "rated", "peak", "needs", "within", "within", "", "support", "motor that"),
     ("joint", "motor", "Nm", "Nm", "Nm", "rated", "peak", "worst pose; pitch, roll (deg)", "within rated", "would do"),
@@ -241,7 +240,7 @@ def arm_budget(
     robot.
     """
     values, motors = configured.compensator, configured.can_bridge["motor"]
-    names = configured.joint_names if configured.by_urdf else JOINTS
+    names = [name.removeprefix(f"{configured.side}_") for name in configured.joint_names]
     bounds = workspace(configured.low, configured.high, max_tilt)
     with named(f"{configured.namespace}/compensator "):
         robot = configured.robot.with_payload(payload, values["payload.cog"])

@@ -233,7 +233,7 @@ def test_held_poses_are_as_uncertain_as_friction(tmp_path):
     unknown = np.full_like(position, np.nan)
     holds = Recording("right", ARM.joint_names, time, position, unknown, gravity_torque(TRUTH, position), unknown)
     upright = replace(ARM, compensator={**ARM.compensator, "use_imu": False})
-    found = recorded.observations_of(write_bag(tmp_path / "bag", messages(holds)), upright)
+    found = recorded.observations_of(write_bag(tmp_path / "bag", messages(holds)), upright, PAPERS)
     np.testing.assert_allclose([o.theta for o in found], poses, atol=1e-3)
     assert np.min([o.spread for o in found]) > 0.2
 
@@ -254,7 +254,10 @@ def test_sweeps_at_five_speeds_give_the_friction_of_each_joint_live_and_recorded
     run = TourRun(truth=truth)
     tour = run.run(fixed(friction_stations(run.limits)))
     assert tour.trouble == ""
-    for measured in (tour.measured, recorded.observations_of(recorded_by(run, tmp_path / "bag"), ARM, with_held=False)):
+    for measured in (
+        tour.measured,
+        recorded.observations_of(recorded_by(run, tmp_path / "bag"), ARM, PAPERS, with_held=False),
+    ):
         result = friction_from(ARM, measured)
         assert result.refusals == ()
         for coulomb, viscous, curve in zip(truth.coulomb_friction, truth.viscous_friction, result.curves, strict=True):

@@ -72,7 +72,7 @@ BLOCK = 8192  # poses at once: what a formula computes on the way stays in the p
 Values = Iterable[Any]  # plain floats, or arrays (n,)
 
 
-@dataclass(frozen=True, eq=False, init=False)
+@dataclass(frozen=True, init=False)
 class ArmModel:
     """Lengths, centres of gravity, masses and gains of a 4-joint arm.
 
@@ -80,10 +80,12 @@ class ArmModel:
     known.
     """
 
-    length: np.ndarray  #: (4,) m, link lengths l_n (the a_n of Table 1)
-    cog: np.ndarray  #: (4,) m, d_n of link n's centre of gravity from joint n along the link, 0 <= d_n <= l_n
-    mass: np.ndarray  #: (4,) kg, link masses m_n
-    gain: np.ndarray  #: (4,), the paper's c_n, which scales the torque of joint n; 0..2, 1 by default
+    length: np.ndarray = field(compare=False)  #: (4,) m, link lengths l_n (the a_n of Table 1)
+    #: (4,) m, d_n of link n's centre of gravity from joint n along the link, 0 <= d_n <= l_n
+    cog: np.ndarray = field(compare=False)
+    mass: np.ndarray = field(compare=False)  #: (4,) kg, link masses m_n
+    #: (4,), the paper's c_n, which scales the torque of joint n; 0..2, 1 by default
+    gain: np.ndarray = field(compare=False)
     gravity: float  #: m/s^2
     off_axis: tuple[float, ...]  #: (W, Z, Y3, Y4) kg m across the links, see above; 0 by default
     #: M1..M4 in kg m: the mass of link n times d_n plus all mass beyond link n times l_n; plain floats
@@ -93,6 +95,7 @@ class ArmModel:
     #: whether the arm was made by `from_moments`; then `cog` and `mass` are NaN
     by_moments: bool = field(init=False, repr=False)
     payload: Payload = field(init=False, repr=False)  #: in the hand, by `with_payload`; the moments contain it
+    arrays: tuple[bytes, ...] = field(init=False, repr=False)  #: the four above, which do not compare by themselves
 
     def __init__(
         self,
@@ -118,8 +121,9 @@ class ArmModel:
         gravity = one_float("gravity", gravity, 0.0, MAX_GRAVITY, "m/s^2")
         across = tuple(four_floats("off_axis", off_axis, -MAX_MOMENT, MAX_MOMENT, "kg m").tolist())
         scale = tuple((gains * gravity).tolist())
-        given = (lengths, cogs, masses, gains, gravity, across, tuple(moments.tolist()), scale, masses is NOT_KNOWN)
-        values = (*given, NO_LOAD)
+        arrays = lengths, cogs, masses, gains
+        given = (gravity, across, tuple(moments.tolist()), scale, masses is NOT_KNOWN, NO_LOAD)
+        values = (*arrays, *given, tuple(array.tobytes() for array in arrays))
         for own_field, value in zip(fields(self), values, strict=True):
             object.__setattr__(self, own_field.name, value)
 
@@ -137,16 +141,6 @@ class ArmModel:
         first_moment: M1..M4, 0..MAX_MOMENT. The other arguments are those of the constructor. Raises ParameterError.
         """
         return cls(length, NOT_KNOWN, NOT_KNOWN, gain, gravity, off_axis, first_moment)
-
-    def __eq__(self, other: object) -> bool:
-        return isinstance(other, ArmModel) and self._key() == other._key()
-
-    def __hash__(self) -> int:
-        return hash(self._key())
-
-    def _key(self) -> tuple[object, ...]:
-        arrays = (self.length, self.gain, self.cog, self.mass)
-        return (*(a.tobytes() for a in arrays), self.first_moment, self.off_axis, self.gravity, self.payload)
 
     @property
     def total_mass(self) -> float:

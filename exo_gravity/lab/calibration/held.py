@@ -55,14 +55,14 @@ def held(
     kept[at.offset] *= unknowns[at.spring] > 0.0
     kept[at.tilt] *= model.keeps_tilt
     turns = kept[at.turn].reshape(-1, TURNS)
-    turns[:, 1:] *= model.kind.is_described
+    turns[:, 1:] *= model.is_described
     free = np.flatnonzero(known)
     left = scale * (new.predicted(unknowns) - new.predicted(kept))
     by_moments = scale[:, None] * new.jacobian(kept)[..., at.moment]
     while True:
         moments = kept[at.moment].copy()
         moments[free] += np.linalg.lstsq(by_moments[..., free].reshape(-1, len(free)), left.ravel(), rcond=None)[0]
-        below = [index for index in free if index in model.kind.at_least_0 and moments[index] < 0.0]
+        below = [index for index in free if index in model.at_least_0 and moments[index] < 0.0]
         if not below:
             break
         left += by_moments[..., below] @ kept[below]  # as if they were 0

@@ -140,14 +140,12 @@ def identify(observations: Sequence[Observation], model: MomentModel, places: Pl
     while True:
         rows = plain.with_extras(extras)
         # With few poses, zeros and axes that are free could explain that one of them was touched.
-        keep, rejected = without_outliers(
-            rows if model.kind.is_described else rows.holding(range(at.turn.start, at.count))
-        )
+        keep, rejected = without_outliers(rows if model.is_described else rows.holding(range(at.turn.start, at.count)))
         fewer = asked_for(plain.only(keep), extras, final)  # an outlier may have looked like a spring
         if fewer == extras:
             break
         extras = fewer
-    used, solution = bounded(rows.only(keep), model.kind.at_least_0)
+    used, solution = bounded(rows.only(keep), model.at_least_0)
     typical, peak = np.median(np.abs(solution.residual), axis=0), np.abs(used.effort).max(axis=0)
     for joint in np.flatnonzero(typical > np.maximum(ACCEPTED.misfit * peak, ACCEPTED.least_misfit)):
         misfit = f"joint {joint + 1} is {typical[joint]:.2f} Nm off in half of the poses"
@@ -236,19 +234,19 @@ def check_physical(
     for joint in np.flatnonzero((scale < low) | (scale > high)):
         expected = f"from {low:g} to {high:g}: is joint {joint + 1}'s direction or motor type wrong, or did it slip?"
         raise DataError(f"torque scale {joint + 1} = {scale[joint]:.3g}: must be {expected}")
-    for index in model.kind.above_0:
+    for index in model.above_0:
         moment, uncertain = f"{model.names[index]} = {moments[index]:.3f} kg m", error[index]
         if uncertain > abs(moments[index]):
             pose = missing_pose(np.arange(layout_of(model).count) == index, direction, model)
             raise DataError(f"{moment} is not known better than {uncertain:.3f}: add the pose {pose}")
         if moments[index] <= 0.0:
             raise DataError(f"{moment}: must be positive: check direction and zero of joint {index + 1}")
-    for across, along in model.kind.across:
+    for across, along in model.across:
         if abs(moments[across]) > moments[along]:
             beside = f"{model.names[across]} = {moments[across]:.3f} kg m exceeds {model.names[along]}"
             angle = math.degrees(math.atan2(moments[across], moments[along]))
             raise DataError(f"{beside}: the zero of joint {along + 1} seems {angle:.0f} degrees off")
-    if model.kind.is_described:
+    if model.is_described:
         _check_like(moments, direction, model)
 
 
@@ -275,7 +273,7 @@ def _unknown(unknowns: np.ndarray, hidden: np.ndarray, relative: bool, model: Mo
         yield f"{names}: {idle} carries nothing while its axis is vertical: {LEAN}."
     elif names:
         yield f"{names}: no pose shows them while the base stands as it does; the file's values are kept."
-    for across, along in model.kind.across:
+    for across, along in model.across:
         angle = math.degrees(math.atan2(unknowns[across], unknowns[along]))
         looks = f"it looks like one of {angle:+.1f} degrees; check the zero with a level or at a stop."
         yield f"{model.names[across]} of link {along + 1} from an error of joint {along + 1}'s zero: {looks}"

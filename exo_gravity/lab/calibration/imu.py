@@ -23,7 +23,7 @@ import yaml
 from scipy.spatial.transform import Rotation
 
 from exo_gravity.core.arm.interface import STANDARD_GRAVITY
-from exo_gravity.core.arm.tilt import angle_between, turning_in_base
+from exo_gravity.core.arm.tilt import Tilt, angle_between
 from exo_gravity.core.errors import DataError, ParameterError
 from exo_gravity.core.numbers import Vector
 from exo_gravity.core.trunk.checks import reported_orientation, reported_vector
@@ -31,8 +31,10 @@ from exo_gravity.core.trunk.params import IMU
 from exo_gravity.hardware.trunk_estimator import ImuSample, TrunkEstimator
 from exo_gravity.lab.calibration.identification import Identified
 from exo_gravity.lab.calibration.live import Say
+from exo_gravity.lab.calibration.moment_model import MomentModel
 from exo_gravity.lab.calibration.recorded import samples_of
 from exo_gravity.lab.calibration.result import CalibrationResult, Change
+from exo_gravity.lab.calibration.tours import model_of
 from exo_gravity.lab.calibration.tracking import mean_direction
 from exo_gravity.lab.inputs.arms import ConfiguredArm, node_values
 from exo_gravity.lab.inputs.parameter_file import load
@@ -337,7 +339,7 @@ def with_mounting(result: CalibrationResult, params: Path) -> CalibrationResult:
     if not 0.0 < error < LARGEST_ERROR:
         return result
     is_whole = heading_error < LARGEST_HEADING_ERROR
-    in_trunk = turn if arm.by_urdf else turn_in_trunk(arm.side, turn)  # a URDF's root link has the trunk's axes
+    in_trunk = turn_in_trunk(model_of(arm), arm.side, turn)
     angle, quaternion = math.degrees(float(np.linalg.norm(turn))), turned(rotation, in_trunk)
     heading = f"heading ±{math.degrees(heading_error):.2f}" if is_whole else "heading unchanged"
     accuracy = f"±{math.degrees(error):.2f} degrees, {heading}"
@@ -364,6 +366,7 @@ def turned(rotation: Vector, turn: np.ndarray) -> np.ndarray:
     return np.asarray((Rotation.from_rotvec(turn) * Rotation.from_quat(rotation)).as_quat())
 
 
-def turn_in_trunk(side: str, turn: np.ndarray) -> np.ndarray:
-    """Return a rotation vector (3,) in an arm's base frame in the trunk's axes."""
-    return np.array([turning_in_base(side, axis) for axis in np.eye(3).tolist()]) @ turn
+def turn_in_trunk(model: MomentModel, side: str, turn: np.ndarray) -> np.ndarray:
+    """Return a rotation vector (3,) in the base frame of a `side` arm in the trunk's axes."""
+    trunk = np.array([model.down(Tilt.of_gravity(side, axis)) for axis in np.eye(3)])  # its axes in the base frame
+    return np.asarray(np.linalg.det(trunk) * trunk @ turn)  # a mirror, as the right arm's, reverses rotations

@@ -7,11 +7,10 @@ links, in kg m.
 """
 
 import itertools
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from copy import copy
 from functools import cached_property
-from operator import attrgetter
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
@@ -39,36 +38,10 @@ MOMENT_PARAMETERS = {"robot.first_moment": slice(JOINT_COUNT), "robot.off_axis":
 Base = Sequence[tuple[int, np.ndarray]]  # of each moment the link's number, and a unit vector (3,) in its frame
 
 
-class Kind(NamedTuple):
-    """What is known of arms of a kind before a tour; by default of those from a URDF."""
-
-    #: A description says about what the arm weighs and its motors give, and the file holds what differs from it: first
-    #: moments of the links, and axes that are askew. Else the file holds the moments, and a fit begins without such.
-    is_described: bool = True
-    down: Callable[[Tilt], Sequence[float]] = attrgetter("gravity_in_trunk")  #: gravity's direction in the base frame
-    worn_along: tuple[int, ...] = ()  #: numbers of those moments of a wearer that must each be plausible
-    at_least_0: tuple[int, ...] = ()  #: numbers of the moments that are 0 where they seem to be less
-    above_0: tuple[int, ...] = ()  #: those that must be above 0, and known
-    across: tuple[tuple[int, int], ...] = ()  #: of a moment across a link, and of the larger one along it
-    rises_from: int = 0  #: the first link that may not point far upwards
-    #: (2, n) rad, lowest and highest angles that are comfortable for a wearer; () if only the limits are known
-    comfortable: tuple[tuple[float, ...], ...] = ()
-
-
-PAPERS = Kind(
-    is_described=False,
-    down=attrgetter("direction"),
-    worn_along=(2, 3),
-    at_least_0=(0,),
-    above_0=(1, 2, 3),
-    across=((7, 3), (6, 2)),
-    rises_from=2,
-    comfortable=((-0.4, -0.17, -0.5, -0.17), (0.6, 1.2, 1.3, 1.7)),
-)
-
-
 class MomentModel:
     """The paper's arm, whose moments are unknown; `DescribedModel` is another one.
+
+    What is known of either kind before a tour stands in the class; the numbers are those of moments.
 
     arm: of which the moments are known so far; its gains do not count.
     uses_imu: whether an IMU measures gravity's direction, whose mounting is corrected by what a fit finds.
@@ -79,7 +52,16 @@ class MomentModel:
     shows_tilt: whether gravity's direction is fitted, too: its turn is also one of the first joint's place.
     """
 
-    kind = PAPERS
+    #: Whether a description says about what the arm weighs and its motors give. The file holds what differs from it:
+    #: first moments of the links, and axes that are askew. Else it holds the moments, and a fit begins without such.
+    is_described = False
+    worn_along: tuple[int, ...] = (2, 3)  #: moments of a wearer that must each be plausible
+    at_least_0: tuple[int, ...] = (0,)  #: moments that are 0 where they seem to be less
+    above_0: tuple[int, ...] = (1, 2, 3)  #: those that must be above 0, and known
+    across: tuple[tuple[int, int], ...] = ((7, 3), (6, 2))  #: of one across a link, and of the larger one along it
+    rises_from = 2  #: the first link that may not point far upwards
+    #: (2, n) rad, lowest and highest angles that are comfortable for a wearer; () if only the limits are known
+    comfortable: tuple[tuple[float, ...], ...] = ((-0.4, -0.17, -0.5, -0.17), (0.6, 1.2, 1.3, 1.7))
     names: tuple[str, ...] = ("M1", "M2", "M3", "M4", "W", "Z", "Y3", "Y4")
     #: link, and direction in its frame, of each moment: x of M1 to M4, z of W and Z, y of Y3 and Y4
     base: Base = tuple(zip((0, 1, 2, 3, 0, 1, 2, 3), np.eye(3)[[0, 0, 0, 0, 2, 2, 1, 1]], strict=True))
@@ -90,7 +72,7 @@ class MomentModel:
 
     def __init__(self, arm: Arm, uses_imu: bool, rotors: Sequence[float] = ()) -> None:
         self.arm, self.gravity, self.count = arm, arm.gravity, len(self.directions)
-        self.keeps_tilt, self.shows_tilt = uses_imu, uses_imu or not self.kind.is_described
+        self.keeps_tilt, self.shows_tilt = uses_imu, uses_imu or not self.is_described
         self._rotors = np.diag(rotors) if len(rotors) else np.zeros((self.count, self.count))
         self.moments = self.moments_of(arm)
         self.suggested = self._suggested()
@@ -103,8 +85,8 @@ class MomentModel:
         return np.asarray(arm.moments)
 
     def down(self, tilt: Tilt) -> np.ndarray:
-        """Return gravity's unit vector (3,) in the base frame of the paper's arm, or the root link's axes."""
-        return np.array(self.kind.down(tilt))
+        """Return gravity's unit vector (3,) in the axes of `Arm.frames`."""
+        return np.array(tilt.direction)
 
     def along_axes(self, theta: np.ndarray) -> np.ndarray:
         """Return the torque (m, n, k, 3) in Nm per kg m with gravity along each axis of the base, at `theta` (m, n)."""
@@ -223,7 +205,7 @@ class MomentModel:
 
     def upwards(self, theta: np.ndarray) -> np.ndarray:
         """Return the sine (m,) of the largest angle of a link above the horizontal of an upright trunk."""
-        ways = np.diff(self.arm.frames(theta).places, axis=1)[:, self.kind.rises_from :]
+        ways = np.diff(self.arm.frames(theta).places, axis=1)[:, self.rises_from :]
         length, rise = np.linalg.norm(ways, axis=2), -ways @ self.down(Tilt.of(SIDES[0]))
         return np.asarray(np.divide(rise, length, out=np.full_like(length, -1.0), where=length > 0.0).max(axis=1))
 
@@ -234,7 +216,9 @@ class DescribedModel(MomentModel):
     Raises ParameterError if a joint that is not the arm's moves its links, or one of them follows another.
     """
 
-    kind = Kind()
+    is_described = True
+    rises_from = 0
+    worn_along = at_least_0 = above_0 = across = comfortable = ()  # a description says enough of its moments
     arm: UrdfArm
 
     def __init__(self, arm: UrdfArm, uses_imu: bool, rotors: Sequence[float] = ()) -> None:
@@ -252,6 +236,10 @@ class DescribedModel(MomentModel):
         low, high = self.arm.ranges
         poses = np.random.default_rng(1).uniform(low, high, (SUGGESTED, self.count))
         return np.radians(STEP * np.round(np.degrees(poses) / STEP))
+
+    def down(self, tilt: Tilt) -> np.ndarray:
+        """Return gravity's unit vector (3,) in the root link's axes, which are the trunk's."""
+        return np.array(tilt.gravity_in_trunk)
 
     def _base_of(self, arm: UrdfArm) -> Base:
         """Return the k moments that gravity's torque can show.

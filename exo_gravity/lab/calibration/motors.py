@@ -16,6 +16,7 @@ from statistics import fmean
 import numpy as np
 from rich.table import Table
 
+from exo_gravity.core.compensation.laws import URDF_LAW
 from exo_gravity.core.errors import DataError, ParameterError
 from exo_gravity.core.motors.ak import FAMILY, MIT, MIT_V3
 from exo_gravity.core.motors.joint_motor import MAX_CAN_ID, OPTIONS, JointMotor, buses_of
@@ -115,7 +116,7 @@ class MotorSearch:
     def result(self, pose: Sequence[float]) -> CalibrationResult:
         """Return the result; pose: (n,) deg in which `zero` is measured. Raises DataError if a motor is not found."""
         self._scan()
-        motions = [TURN] * len(self._arm.joint_names) if self._arm.by_urdf else MOTIONS
+        motions = [TURN] * len(self._arm.motors) if self._arm.compensator["law"] == URDF_LAW else MOTIONS
         for name, motion in zip(self._arm.joint_names, motions, strict=True):
             self._watch(f"{name}: {motion}, by 30 degrees or so, and back", partial(self._found_by, name))
         where = f"{' '.join(f'{angle:g}' for angle in pose)} deg" if any(pose) else ""

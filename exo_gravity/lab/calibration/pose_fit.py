@@ -219,7 +219,7 @@ def rows_of(observations: Sequence[Observation], model: MomentModel, places: Pla
     # Without a weight a common factor of scales and moments does not show.
     product = unit[at.scale][model.compared].sum(axis=0, keepdims=True) * (not np.any(load))
     tilt = unit[at.tilt] / (FIT.tilt_error if model.shows_tilt else EXACT)
-    scales = unit[at.scale] / FIT.scale_error if model.kind.is_described else unit[:0]
+    scales = unit[at.scale] / FIT.scale_error if model.is_described else unit[:0]
     turned_by = np.resize((places.zero, places.axis, places.axis), TURNS * model.count)
     if model.shows_tilt:
         turned_by[:TURNS] = 0.0  # the whole arm turns with its first joint, which is the same as gravity turned

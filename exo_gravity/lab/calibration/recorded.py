@@ -19,6 +19,7 @@ from exo_gravity.lab.bag.content import TILT_TOPIC, Bag
 from exo_gravity.lab.bag.layout import Decoder
 from exo_gravity.lab.bag.reader import read_bag
 from exo_gravity.lab.bag.storage import Storage
+from exo_gravity.lab.calibration.moment_model import MomentModel
 from exo_gravity.lab.calibration.tracking import MOTION, Observation, Sweep, average, mean_direction
 from exo_gravity.lab.inputs.arms import ConfiguredArm
 from exo_gravity.lab.trial.recording import Recording, in_blocks, still_spans
@@ -40,9 +41,10 @@ class Detection:
 DETECTION = Detection()
 
 
-def observations_of(path: Path, arm: ConfiguredArm, with_held: bool = True) -> list[Observation]:
+def observations_of(path: Path, arm: ConfiguredArm, model: MomentModel, with_held: bool = True) -> list[Observation]:
     """Return the observations in the recording of `arm` at `path`: sweeps there and back, and poses held.
 
+    model: of the arm, which has its base frame.
     with_held: False for sweeps alone, which show friction.
 
     Raises DataError if there are none.
@@ -51,7 +53,7 @@ def observations_of(path: Path, arm: ConfiguredArm, with_held: bool = True) -> l
     recording = recording_of(bag, arm)
     effort = np.where(np.isfinite(recording.command), recording.command, recording.effort)  # as commanded, where known
     recording = replace(recording, position=recording.position.astype(float), effort=effort)
-    down = _down(bag, arm, recording.time)
+    down = _down(bag, arm, model, recording.time)
     observations = list(_sweeps(recording, down))
     if with_held:
         observations += list(_held(recording, down, observations))
@@ -70,19 +72,14 @@ def recording_of(bag: Bag, arm: ConfiguredArm) -> Recording:
     return recording.in_order(arm.joint_names)
 
 
-def _down(bag: Bag, arm: ConfiguredArm, times: np.ndarray) -> np.ndarray:
+def _down(bag: Bag, arm: ConfiguredArm, model: MomentModel, times: np.ndarray) -> np.ndarray:
     """Return gravity's direction (n, 3) in the base frame at `times` (n,) s, from the trunk's tilts if it uses any."""
     if not arm.compensator["use_imu"]:
-        return np.tile(_base_direction(arm, Tilt.of(arm.side)), (len(times), 1))
+        return np.tile(model.down(Tilt.of(arm.side)), (len(times), 1))
     if not len(bag.tilt):
         raise DataError(f"{bag.path}: no samples of {TILT_TOPIC}, which gravity's direction comes from")
-    components = np.array([_base_direction(arm, tilt) for tilt in tilts_of(bag, arm.side)]).T
+    components = np.array(list(map(model.down, tilts_of(bag, arm.side)))).T
     return np.stack([np.interp(times, bag.tilt[:, 0], component) for component in components], axis=1)
-
-
-def _base_direction(arm: ConfiguredArm, tilt: Tilt) -> tuple[float, float, float]:
-    """Return gravity's direction (3,) in the base frame, which a URDF has in the trunk's axes."""
-    return tilt.gravity_in_trunk if arm.by_urdf else tilt.direction
 
 
 def tilts_of(bag: Bag, side: str) -> list[Tilt]:

@@ -100,7 +100,7 @@ def wearer_from(
         _bridge_line(arm, worn, found.moments, fit),
     )  # fmt: skip
     changes = (*found.changes, *_spring_changes(arm, fit, unsure, carried))
-    if arm.by_urdf and "model_error.torque" not in arm.compensator:  # whose default is for the paper's joints
+    if "model_error.torque" not in arm.compensator:
         assumed = list(for_joints(torque_error(arm), len(arm.joint_names), max))
         note = "Nm of the robot, assumed: `calibrate gravity` measures it"
         changes = (*changes, Change(f"{arm.namespace}/compensator", "model_error.torque", assumed, note))

@@ -59,10 +59,10 @@ class WornArm:
 
     def __init__(self, arm: ConfiguredArm) -> None:
         values, self._arm, self.model = arm.compensator, arm, model_of(arm)
-        robot, kind = self.model.arm, self.model.kind
+        robot = self.model.arm
         given = (*values["wearer.mass"], values["wearer.body_mass"], *values.get("wearer.first_moment", ()))
         self._is_known = any(given)
-        if not self._is_known and kind.is_described:
+        if not self._is_known and self.model.is_described:
             expected = "the wearer's, in kg, or wearer.mass and wearer.cog: they also give the inertia"
             raise ParameterError(f"{arm.namespace}/compensator wearer.body_mass", values["wearer.body_mass"], expected)
         assumed = {} if self._is_known else {"wearer.body_mass": WORN.body_mass}
@@ -75,7 +75,7 @@ class WornArm:
         home, low, high = np.array(arm.limits.home), arm.low, arm.high
         down, up = (np.clip(WORN.share * way, *WORN.reach) for way in (home - low, high - home))
         usual = np.maximum(low, home - down), np.minimum(high, home + up)
-        self.comfortable = np.array(kind.comfortable or usual)
+        self.comfortable = np.array(self.model.comfortable or usual)
 
     def _prior(self, mass: np.ndarray, cog: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return what is known before: the table's masses within a half, and their places within some centimetres."""
@@ -97,9 +97,9 @@ class WornArm:
         mass, why = float(fit.moments[::4].sum()), "is the arm relaxed, the robot calibrated?"
         if mass > WORN.most:
             raise DataError(f"the wearer's arm = {mass:.1f} kg: must be at most {WORN.most:g}: is the arm relaxed?")
-        own, kind = fit.covariance[: len(fit.moments), : len(fit.moments)], self.model.kind
+        own = fit.covariance[: len(fit.moments), : len(fit.moments)]
         moments, errors = self.to_moments @ fit.moments, np.sqrt(np.diag(self.to_moments @ own @ self.to_moments.T))
-        for k in kind.worn_along:
+        for k in self.model.worn_along:
             shown = f"{self.model.names[k]} of the wearer = {moments[k]:.3f} +- {errors[k]:.3f} kg m"
             if not moments[k] > errors[k] / WORN.largest_error:
                 raise DataError(f"{shown}: {why}")
@@ -117,7 +117,7 @@ class WornArm:
         compared = f"{share:.0%} of the torque at {name} that {whose} needs"
         ratios = {compared: share} | {
             f"{moments[k] / self._expected[k]:.0%} of {self.model.names[k]} of {whose}": moments[k] / self._expected[k]
-            for k in kind.worn_along
+            for k in self.model.worn_along
         }
         refusals = tuple(
             f"implausible: {what}: must be from {low:.0%} to {high:.0%}"
@@ -125,7 +125,7 @@ class WornArm:
             if self._is_known and not low <= ratio <= high
         )
         node = f"{self._arm.namespace}/compensator"
-        noted = f"kg m, +-{errors.max():.2g} at most" if kind.is_described else f"kg m, +-{row(errors)}"
+        noted = f"kg m, +-{errors.max():.2g} at most" if self.model.is_described else f"kg m, +-{row(errors)}"
         parts = self.model.worn_in_file(moments).items()
         changes = [Change(node, parameter, (part.round(5) + 0.0).tolist(), noted) for parameter, part in parts]
         if self._arm.compensator["law"] not in ("exact", URDF_LAW):

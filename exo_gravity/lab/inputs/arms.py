@@ -68,14 +68,9 @@ class ConfiguredArm:
         return np.array(self.limits.position_max)
 
     @property
-    def by_urdf(self) -> bool:
-        """Whether a URDF describes it."""
-        return bool(self.compensator["law"] == URDF_LAW)
-
-    @property
     def paper_arm(self) -> ArmModel:
         """The robot, for what no other arm than the paper's has. Raises ParameterError."""
-        if self.by_urdf:
+        if self.compensator["law"] == URDF_LAW:
             expected = "exact: this is for the paper's arm alone"
             raise ParameterError(f"{self.namespace}/compensator law", URDF_LAW, expected)
         return cast(ArmModel, self.robot)

@@ -328,7 +328,7 @@ DOWN = np.array(Tilt.of("right", 0.05, 0.21).direction)  # a stand that leans to
 
 def in_trunk(side, direction):
     """Return a direction in an arm's base frame in the trunk's axes; the right arm's base is a mirror image."""
-    return turn_in_trunk(side, direction) * (1.0 if side == "left" else -1.0)
+    return turn_in_trunk(PAPERS, side, direction) * (1.0 if side == "left" else -1.0)
 
 
 def leant(axis, angle):
@@ -365,7 +365,7 @@ def test_the_corrected_mounting_is_the_old_one_after_the_turn():
 def test_a_turn_in_the_arms_base_moves_gravity_as_in_the_trunk(side):
     turn, direction = np.array((0.01, -0.02, 0.03)), np.array(Tilt.of(side, 0.2, 0.1).direction)
     np.testing.assert_allclose(in_trunk(side, direction), gravity_in_trunk(0.2, 0.1), atol=1e-12)
-    moved = np.cross(turn_in_trunk(side, turn), gravity_in_trunk(0.2, 0.1))
+    moved = np.cross(turn_in_trunk(PAPERS, side, turn), gravity_in_trunk(0.2, 0.1))
     np.testing.assert_allclose(moved, in_trunk(side, np.cross(turn, direction)), atol=1e-12)
 
 
