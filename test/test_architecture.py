@@ -184,3 +184,11 @@ def test_a_module_is_imported_without_what_it_may_not_need(modules: tuple[str, .
     imports = "; ".join(f"import exo_gravity.{module}" for module in modules)
     program = f"import sys; sys.modules[{missing!r}] = None; {imports}"
     subprocess.run([sys.executable, "-c", program], cwd=ROOT, check=True, timeout=PATIENCE)
+
+
+def test_the_fits_of_calibrate_take_one_core() -> None:
+    program = (
+        "import os; os.environ.pop('OPENBLAS_NUM_THREADS', None); import exo_gravity.tools.calibrate; "
+        "from threadpoolctl import threadpool_info; assert {pool['num_threads'] for pool in threadpool_info()} == {1}"
+    )
+    subprocess.run([sys.executable, "-c", program], cwd=ROOT, check=True, timeout=PATIENCE)

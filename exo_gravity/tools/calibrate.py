@@ -10,11 +10,16 @@ Exit code 0: calibrated. 1: not calibrated, and why. 2: wrong use or wrong file.
 """
 
 import argparse
+import os
 import sys
 from collections.abc import Callable, Sequence
 from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING
+
+# Before NumPy is imported, here and in the nodes of a tour: its threads gain nothing on matrices this small, and would
+# wait for each other on the cores that carry the arm.
+os.environ.setdefault("OMP_NUM_THREADS", "1")
 
 from exo_gravity import require_ros
 from exo_gravity.core.arm.tilt import SIDES
