@@ -21,7 +21,6 @@ from xml.etree.ElementTree import Element
 
 import numpy as np
 
-from exo_gravity.core.arm.chain import frames
 from exo_gravity.core.arm.paper import ArmModel
 from exo_gravity.core.compensation.laws import URDF_LAW
 from exo_gravity.core.compensation.settings import robot_of
@@ -81,12 +80,10 @@ class OnTrunk:
 
     def pose(self, theta: Sequence[float]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Return where the arm is at `theta` (4,) rad, as `Described.pose`."""
-        length, base = self.robot.length, (0.0, self.outward * HALF_BREADTH, 0.0)
-        links = frames(length.tolist(), theta)
-        along = self._in_trunk([link.along for link in links])
-        axes = self._in_trunk([link.axis for link in links]) * self.outward  # a mirror reverses rotations
-        origins = self._in_trunk([link.origin for link in links]) + (self.shoulder if any(self.shoulder) else base)
-        return np.vstack((origins, origins[3] + length[3] * along[3])), axes, along
+        frames = self.robot.frames(np.array([theta]))
+        base = self.shoulder if any(self.shoulder) else (0.0, self.outward * HALF_BREADTH, 0.0)
+        axes = self._in_trunk(frames.before[0, :, :, 2]) * self.outward  # a mirror reverses rotations
+        return self._in_trunk(frames.places[0]) + base, axes, self._in_trunk(frames.after[0, :, :, 0])
 
     def bodies(self) -> tuple[np.ndarray, np.ndarray]:
         """Return mass (4,) kg and centre of gravity (4, 3) m of each link, as `UrdfArm.bodies`.
@@ -108,9 +105,9 @@ class OnTrunk:
         out = self.outward
         return mass, np.array(((w, out * a1, 0.0), (0.0, -out * z, -a2), (y3, 0.0, -a3), (y4, 0.0, -a4)))
 
-    def _in_trunk(self, points: Sequence[Sequence[float]]) -> np.ndarray:
+    def _in_trunk(self, points: np.ndarray) -> np.ndarray:
         """Return vectors (n, 3) of the arm's base frame in the trunk's axes: x0 outward, y0 forward, z0 down."""
-        x, y, z = np.array(points).T
+        x, y, z = points.T
         return np.stack((y, self.outward * x, -z), axis=1)
 
 
