@@ -423,12 +423,15 @@ def test_the_share_of_the_recording_and_of_each_joint_is_found_and_said(share, i
     assert part.whole.value == pytest.approx(share, abs=0.005) and known.sum() >= 3
     np.testing.assert_allclose(part.joints.value[known], share, atol=0.005)
     assert part.curve.time[0] >= 1.0 and part.curve.time[-1] <= 7.0  # while the arm was carried
-    said, simulated = (wearer_share.sentence(part, source) for source in (Source.REAL, Source.SIMULATED))
+    said, simulated, here = (
+        next(wearer_share.sentences(part, source, recording.joint_names))
+        for source in (Source.REAL, Source.SIMULATED, Source.UNKNOWN)
+    )
     assert simulated == f"In the simulation, t{said[1:]}" and f"{100 * share:.0f} % of their arm's weight" in said
     assert not is_paper or ("not distinguishable from zero" in said) == (share == 0.0)
     assert "right_wearer.png" in [path.name for path in write(report, tmp_path)]
     page = page_in(tmp_path).text
-    assert wearer_share.sentence(part, Source.UNKNOWN).split("(")[0] in page  # as this recording has it
+    assert here.split("(")[0] in page  # as this recording has it
     shown = [name for name, is_known in zip(recording.joint_names, known, strict=True) if is_known]
     assert all(f"{name} {100 * share:.0f} % (±" in page for name in shown)
 
@@ -442,7 +445,7 @@ def test_a_share_needs_a_wearer_the_trunks_tilt_and_something_to_carry():
     upright = with_wearer(replace(shared(0.4), carried=None), {**GIVEN, "use_imu": False})
     assert upright.wearers["right"].curve.time[0] == 0.0
     hanging = with_wearer(still(JOINTS, (0.0,) * 4, (0.0,) * 4), {**GIVEN, "use_imu": False})
-    assert "nothing to carry" in wearer_share.sentence(hanging.wearers["right"], Source.UNKNOWN)
+    assert "nothing to carry" in next(wearer_share.sentences(hanging.wearers["right"], Source.UNKNOWN, JOINTS))
 
 
 # Of many recordings: a row for each, and one that fails is named

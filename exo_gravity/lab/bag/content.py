@@ -89,6 +89,12 @@ class Bag:
     tilt: np.ndarray = field(default_factory=lambda: np.empty((0, 3)))
     sources: dict[str, Source] = field(default_factory=dict)  #: what the arms' nodes say of them, by arm
 
+    @property
+    def trial(self) -> str:
+        """The name of the trial's folder: `trial` records into NAME_DATE_TIME/bag."""
+        path = self.path.resolve()
+        return path.parent.name if path.stem == "bag" else path.stem
+
     def source(self, arm: str) -> Source:
         """Return whether `arm` was simulated: as its nodes say, else by their parameters."""
         from exo_gravity.lab.inputs.arms import recorded_of  # not for the nodes that record and show

@@ -82,8 +82,7 @@ def write_lerobot(folder: Path, bags: Iterable[Bag], rate: int) -> None:
         if joints != names:
             raise DataError(f"{bag.path}: joints = {joints['action']}: must be {names['action']}, as in the others")
         place = {"chunk_index": number // FILES, "file_index": number % FILES}
-        path, count = bag.path.resolve(), len(frames["action"])
-        task = bag.session.protocol or TIMESTAMP.sub("", path.parent.name if path.stem == "bag" else path.stem)
+        count, task = len(frames["action"]), bag.session.protocol or TIMESTAMP.sub("", bag.trial)
         task_index = tasks.setdefault(task, len(tasks))
         table: dict[str, Any] = {
             name: pa.FixedSizeListArray.from_arrays(values.astype(np.float32).ravel(), values.shape[1])

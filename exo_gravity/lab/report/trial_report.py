@@ -147,15 +147,9 @@ class Report:
         return f"{held}{worst if event else ''}", not self.failures
 
     @property
-    def trial(self) -> str:
-        """The name of the trial's folder: `trial` records into NAME_DATE_TIME/bag."""
-        path = self.bag.path.resolve()
-        return path.parent.name if path.stem == "bag" else path.stem
-
-    @property
     def title(self) -> str:
         """Name of the trial, arms and date: 'demo, right arm, 2026-03-14'."""
-        name = TIMESTAMP.sub("", self.trial)
+        name = TIMESTAMP.sub("", self.bag.trial)
         sides = " and ".join(recording.name for recording in self.bag.recordings)
         arms = sides if sides == "arm" else f"{sides} arm{'s' if len(self.bag.recordings) > 1 else ''}"
         return f"{name.replace('_', ' ')}, {arms}, {self.start:%Y-%m-%d}"
@@ -172,7 +166,7 @@ class Report:
             in_force.pop("support", None)
         settings = {key: str(in_force.get(key, "")) for key in ("side", "mode", "support")}
         session, source = self.bag.session, self.bag.source(arm).value
-        of_whom = {"trial": self.trial, "subject": session.subject, "arm": arm, "source": source}
+        of_whom = {"trial": self.bag.trial, "subject": session.subject, "arm": arm, "source": source}
         return {**of_whom, **settings, "version": session.version}
 
 
@@ -298,8 +292,8 @@ def write(
             if text := figures.stayed_text(recording, analysis):
                 pictures.append(html.bullets("", [text]))
             if shared:
-                of_joints = wearer_share.joint_sentence(shared, recording.joint_names)
-                pictures.append(html.bullets("Wearer", [wearer_share.sentence(shared, source), of_joints]))
+                sentences = wearer_share.sentences(shared, source, recording.joint_names)
+                pictures.append(html.bullets("Wearer", sentences))
             sections += table.arm_section(recording, analysis, pictures)
         (folder / "report.html").write_text(_page(report, sections), encoding="utf-8")
         seconds = max(float(recording.time[-1]) for recording in report.bag.recordings)
@@ -324,8 +318,8 @@ def print_report(report: Report, console: Console | None = None) -> None:
     for recording, analysis in report.arms:
         table.print_tables(console, recording, analysis)
         if part := report.wearers.get(recording.name):
-            console.print(marked(wearer_share.sentence(part, report.bag.source(recording.name))))
-            console.print(marked(wearer_share.joint_sentence(part, recording.joint_names)))
+            for sentence in wearer_share.sentences(part, report.bag.source(recording.name), recording.joint_names):
+                console.print(marked(sentence))
     for note in report.notes:
         console.print(f"[yellow]Note:[/] {marked(note)}.")
     for problem in report.bag.problems:

@@ -7,7 +7,7 @@ start.
 """
 
 from bisect import bisect_left
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -64,23 +64,20 @@ def of_arm(bag: Bag, recording: Recording) -> WearerPart | None:
     return WearerPart(curve, share_of(curve, SHARE.window), share_of(curve), joint_shares(curve))
 
 
-def sentence(part: WearerPart, source: Source) -> str:
-    """Return the share over the recording, with its 95 % band."""
+def sentences(part: WearerPart, source: Source, names: Sequence[str]) -> Iterator[str]:
+    """Yield the share over the recording, and that of each joint, with their 95 % bands. names: of the joints (n,)."""
     share = part.whole
     where = "In the simulation, the" if source is Source.SIMULATED else "The"
-    if not np.isfinite(share.value):
-        return f"{where} wearer's arm hung all the time: there was nothing to carry."
-    band = COVER * float(share.deviation)
-    value = f"{100.0 * float(share.value):.0f} % of their arm's weight (95 % band ±{100.0 * band:.0f})"
-    caveat = "" if abs(share.value) > band else ": not distinguishable from zero"
-    return f"{where} wearer carried {value}{caveat}."
-
-
-def joint_sentence(part: WearerPart, names: Sequence[str]) -> str:
-    """Return the share of each joint over the recording, with its 95 % band. names: of the joints (n,)."""
+    if np.isfinite(share.value):
+        band = COVER * float(share.deviation)
+        value = f"{100.0 * float(share.value):.0f} % of their arm's weight (95 % band ±{100.0 * band:.0f})"
+        caveat = "" if abs(share.value) > band else ": not distinguishable from zero"
+        yield f"{where} wearer carried {value}{caveat}."
+    else:
+        yield f"{where} wearer's arm hung all the time: there was nothing to carry."
     known = [
         f"{name} {100.0 * value:.0f} % (±{100.0 * COVER * deviation:.0f})"
         for name, value, deviation in zip(names, *part.joints, strict=True)
         if np.isfinite(value)
     ]
-    return f"Of each joint's own weight: {', '.join(known) or 'no joint had any'}."
+    yield f"Of each joint's own weight: {', '.join(known) or 'no joint had any'}."
