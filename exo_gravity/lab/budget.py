@@ -160,22 +160,21 @@ def budget(
     upright = np.repeat((1.0, 0.0), (count, 2))
     starts = np.vstack((points[: SAMPLES // 5] * upright, points))  # those with an upright trunk first
 
-    def need(at: np.ndarray) -> np.ndarray:
-        own, added = torques(at)
+    def need(own: np.ndarray, added: np.ndarray) -> np.ndarray:
         return np.asarray(np.abs(own + support * added))
 
-    def shortage(at: np.ndarray) -> np.ndarray:
+    def shortage(own: np.ndarray, added: np.ndarray) -> np.ndarray:
         """Return the negative of the largest support, at most 1, within rated torque; 1 where none fits."""
-        own, added = torques(at)
         room = rated - np.sign(added) * own  # in the direction of the wearer's torque
         most = np.divide(room, np.abs(added), out=np.ones_like(room), where=np.abs(added) > 1e-9)
         return np.where(np.abs(own) > rated, 1.0, -np.minimum(most, 1.0))
 
-    needs, shortages = need(starts), shortage(starts)
+    at_starts = torques(starts)
+    needs, shortages = need(*at_starts), shortage(*at_starts)
     joints = []
     for joint, limits in enumerate(zip(map(float, rated), map(float, peak), strict=True)):
-        worst, torque = _worst(need, joint, bounds, starts, needs[:, joint])
-        _, short = _worst(shortage, joint, bounds, starts, shortages[:, joint])
+        worst, torque = _worst(lambda at: need(*torques(at)), joint, bounds, starts, needs[:, joint])
+        _, short = _worst(lambda at: shortage(*torques(at)), joint, bounds, starts, shortages[:, joint])
         # The search can find an overloaded pose that no sample shows. Then the share must not be 1.
         low, high = (
             _rounded_down(min(float(np.mean(needs[-SAMPLES:, joint] <= limit)), 0.9999 if torque > limit else 1.0))
