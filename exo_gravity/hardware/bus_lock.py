@@ -23,10 +23,10 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 from exo_gravity.core.errors import BusError
+from exo_gravity.core.motors.joint_motor import Address
 from exo_gravity.core.numbers import MAX_JOINTS
 from exo_gravity.core.safety.drive import Drive, Send
 from exo_gravity.core.safety.limits import DAMPING, MAX_EFFORT
-from exo_gravity.hardware.can_port import Address, ArmOnBus
 from exo_gravity.hardware.clock import COMPUTER_CLOCK, Clock
 
 ATTEMPT_TIME = 1.0  # s; a watchdog with nothing to do may take that long to end after its bridge
@@ -179,32 +179,6 @@ class ArmNotes:
     def heartbeat(self) -> float:
         """S, at which the watchdog last ran; 0 before it runs."""
         return self._pages[0].heartbeat
-
-
-class ArmLock:
-    """Exclusive ownership of every bus of `arm` until `release`. `BusLock` explains the arguments.
-
-    The buses are locked in the order of their names: two owners never wait for each other. Raises BusError, and owns
-    none, if one is held.
-    """
-
-    def __init__(self, arm: ArmOnBus, owner: str, patience: float, clock: Clock) -> None:
-        self.locks: list[BusLock] = []  #: of the buses
-        own: dict[int, BusLock] = {}
-        try:
-            for part in sorted(arm.parts, key=lambda part: bus_name(part.address)):
-                self.locks.append(BusLock(part.address, owner, patience, clock, asks=True))
-                own |= dict.fromkeys(part.joints, self.locks[-1])
-        except BaseException:
-            self.release()
-            raise
-        self.of_joints = [own[joint] for joint in range(len(arm.motors))]  #: (n,) of the bus of each joint's motor
-        self.notes = ArmNotes([lock.notes for lock in self.of_joints])
-
-    def release(self) -> None:
-        """Give up all buses: they are free once the watchdog has ended, too."""
-        for lock in self.locks:
-            lock.release()
 
 
 @contextlib.contextmanager

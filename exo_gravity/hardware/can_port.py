@@ -32,7 +32,7 @@ from can.interfaces.udp_multicast import UdpMulticastBus
 
 from exo_gravity.core.errors import BusError, ParameterError
 from exo_gravity.core.motors.frames import EXTENDED, ID_BITS, Frame
-from exo_gravity.core.motors.joint_motor import JointMotor, buses_of, channels_of, is_fd
+from exo_gravity.core.motors.joint_motor import Address, JointMotor, buses_of, channels_of, is_fd
 from exo_gravity.core.safety.limits import Limits
 from exo_gravity.hardware.clock import Clock
 
@@ -44,7 +44,6 @@ POLL_TIME = 0.0005  # s for which one of several buses is awaited that cannot be
 MAX_STALE_FRAMES = 256  # the capacity of udp_multicast, more than any cycle produces
 SYSFS = Path("/sys")
 CLASSES = {"socketcan": "net", "slcan": "tty"}  # in sysfs, of the channels of an interface
-Address = tuple[str, str, Mapping[str, Any]]  # interface, channel and options of a python-can bus
 
 
 def open_bus(interface: str, channel: str, options: Mapping[str, Any]) -> can.BusABC:

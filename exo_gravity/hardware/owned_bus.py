@@ -20,7 +20,7 @@ from exo_gravity.core.errors import BusError
 from exo_gravity.core.safety.drive import Send
 from exo_gravity.core.safety.machine import SafetyMachine
 from exo_gravity.core.safety.watch import excess_torque, expected_torque
-from exo_gravity.hardware.bus_lock import ATTEMPT_TIME, ArmLock, ArmNotes
+from exo_gravity.hardware.bus_lock import ATTEMPT_TIME, ArmNotes, BusLock, bus_name
 from exo_gravity.hardware.can_port import ArmOnBus, CanPort
 from exo_gravity.hardware.clock import COMPUTER_CLOCK, Clock
 from exo_gravity.hardware.control_loop import ControlLoop, NoController
@@ -121,6 +121,32 @@ class Silence:
         self._duration = self._duration + min(now - self._last_look, self._longest_look) if is_silent else 0.0
         self._last_look, self._sign = now, sign
         return self._duration
+
+
+class ArmLock:
+    """Exclusive ownership of every bus of `arm` until `release`. `BusLock` explains the arguments.
+
+    The buses are locked in the order of their names: two owners never wait for each other. Raises BusError, and owns
+    none, if one is held.
+    """
+
+    def __init__(self, arm: ArmOnBus, owner: str, patience: float, clock: Clock) -> None:
+        self.locks: list[BusLock] = []  #: of the buses
+        own: dict[int, BusLock] = {}
+        try:
+            for part in sorted(arm.parts, key=lambda part: bus_name(part.address)):
+                self.locks.append(BusLock(part.address, owner, patience, clock, asks=True))
+                own |= dict.fromkeys(part.joints, self.locks[-1])
+        except BaseException:
+            self.release()
+            raise
+        self.of_joints = [own[joint] for joint in range(len(arm.motors))]  #: (n,) of the bus of each joint's motor
+        self.notes = ArmNotes([lock.notes for lock in self.of_joints])
+
+    def release(self) -> None:
+        """Give up all buses: they are free once the watchdog has ended, too."""
+        for lock in self.locks:
+            lock.release()
 
 
 class Watchdog:

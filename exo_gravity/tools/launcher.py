@@ -113,8 +113,9 @@ def main(args: Sequence[str] | None = None) -> None:
         print(f"launcher: {error}", file=sys.stderr)
         raise SystemExit(2) from None
     if dead:
-        node, code = dead
-        print(f"launcher: {node.lstrip('/')} ended with exit code {code}; all nodes were stopped", file=sys.stderr)
+        print(
+            f"launcher: {dead[0].lstrip('/')} ended with exit code {dead[1]}; all nodes were stopped", file=sys.stderr
+        )
     for node in launcher.maybe_powered:
         print(f"launcher: the motors of {node} may still be powered: cut their supply", file=sys.stderr)
     if dead or launcher.maybe_powered:

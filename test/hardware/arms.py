@@ -21,11 +21,11 @@ from exo_gravity.core.compensation.settings import Settings
 from exo_gravity.core.errors import BusError
 from exo_gravity.core.motors.ak import MIT
 from exo_gravity.core.motors.frames import WireFormat
-from exo_gravity.core.motors.joint_motor import JointMotor, channels_of
+from exo_gravity.core.motors.joint_motor import Address, JointMotor, channels_of
 from exo_gravity.core.safety.drive import State
 from exo_gravity.core.safety.limits import Limits
 from exo_gravity.hardware.bus_lock import DriveNotes
-from exo_gravity.hardware.can_port import Address, ArmOnBus, CanPort, open_bus
+from exo_gravity.hardware.can_port import ArmOnBus, CanPort, open_bus
 from exo_gravity.hardware.motor_bus import MotorBus
 from exo_gravity.sim import ArmConfig, SimulatedMotor
 from exo_gravity.sim.arm import DEFAULT_LINKS, SimulatedArm

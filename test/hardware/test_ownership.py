@@ -20,12 +20,12 @@ from exo_gravity.core.errors import BusError
 from exo_gravity.core.motors.ak import MIT, MIT_V3
 from exo_gravity.core.motors.families import MOTORS
 from exo_gravity.core.motors.frames import ENTER, EXIT, ID_BITS, MotorCommand, WireFormat, unpack_command
+from exo_gravity.core.motors.joint_motor import Address
 from exo_gravity.core.safety.limits import MAX_EFFORT_RATE
 from exo_gravity.hardware import bus_lock, owned_bus
 from exo_gravity.hardware.bus_lock import (
     ATTEMPT_TIME,
     UNKNOWN_DRIVE,
-    ArmLock,
     ArmNotes,
     BusLock,
     bridge_of,
@@ -33,8 +33,7 @@ from exo_gravity.hardware.bus_lock import (
     is_asked_for,
     notes_file,
 )
-from exo_gravity.hardware.can_port import Address
-from exo_gravity.hardware.owned_bus import OwnedBus, let_down, take_over
+from exo_gravity.hardware.owned_bus import ArmLock, OwnedBus, let_down, take_over
 from exo_gravity.sim.events import ACTS
 from exo_gravity.sim.virtual_time import VirtualBus, VirtualClock
 
@@ -296,7 +295,7 @@ def test_the_locks_are_taken_in_one_order_however_the_motors_are_wired(
         taken.append(address[1])
         return BusLock(address, *others, **options)
 
-    monkeypatch.setattr(bus_lock, "BusLock", noted)
+    monkeypatch.setattr(owned_bus, "BusLock", noted)
     on_bus, (first, second) = CarriedArm(channel=ON_TWO).on_bus, order
     crossed = replace(on_bus, address=("wire", f"{first},{second},{second},{first}", {}))
     ArmLock(crossed, "a test", 0.1, VirtualClock()).release()

@@ -19,9 +19,9 @@ import pytest
 
 from exo_gravity.core.errors import BusError
 from exo_gravity.core.safety.limits import Limits
-from exo_gravity.hardware.bus_lock import ArmLock, ArmNotes, BusLock, bridge_of
+from exo_gravity.hardware.bus_lock import ArmNotes, BusLock, bridge_of
 from exo_gravity.hardware.clock import COMPUTER_CLOCK
-from exo_gravity.hardware.owned_bus import OwnedBus, Watchdog
+from exo_gravity.hardware.owned_bus import ArmLock, OwnedBus, Watchdog
 from exo_gravity.hardware.watchdog import SleepInhibitor, guard
 from exo_gravity.sim.virtual_time import VirtualClock
 

@@ -54,6 +54,7 @@ NEED_BITRATE = (
     "canalystii", "cantact", "gs_usb", "iscan", "ixxat", "kvaser", "neousys", "neovi", "nican", "nixnet", "pcan",
     "robotell", "seeedstudio", "slcan", "systec", "usb2can", "vector",
 )  # fmt: skip
+Address = tuple[str, str, Mapping[str, Any]]  # interface, channel and options of a python-can bus
 
 
 class JointSample(NamedTuple):

@@ -28,9 +28,9 @@ from exo_gravity.core.errors import BusError
 from exo_gravity.core.motors.ak import FAMILY, MIT
 from exo_gravity.core.motors.families import FAMILIES, MOTORS, every_family
 from exo_gravity.core.motors.frames import COMMAND, EXTENDED, OTHER, REPLY, WireFormat
-from exo_gravity.core.motors.joint_motor import MAX_CAN_ID, MAX_STATUS_RATE, is_fd
+from exo_gravity.core.motors.joint_motor import MAX_CAN_ID, MAX_STATUS_RATE, Address, is_fd
 from exo_gravity.hardware.bus_lock import BusLock
-from exo_gravity.hardware.can_port import Address, CanPort, open_bus
+from exo_gravity.hardware.can_port import CanPort, open_bus
 from exo_gravity.hardware.clock import COMPUTER_CLOCK, Clock
 from exo_gravity.hardware.motor_bus import LISTEN_TIME
 
