@@ -121,6 +121,7 @@ REFUSED = {  # a file, what is said of it, and whether rcl refuses it too, inste
     "two types": (f"{ENTRY}    a: [1, 2.5]\n", r"/right/tried a = \[1, 2\.5\]: must be a list of one type", True),
     "truth and text": (f"{ENTRY}    a: [yes, maybe]\n", r"a = \[True, 'maybe'\]: must be a list of one type", True),
     "list in list": (f"{ENTRY}    a: [[1], [2]]\n", r"/right/tried a = .*: must be a list of values \(line 3\)", False),
+    "brackets in brackets": (f"{ENTRY}    a: {'[' * 100_000}\n", r"f, line 3 = 'brackets in brackets'", False),
     "no parameters": ("/right/tried:\n  ros__parameters:\n", r"f, line 2 = '/right/tried': must be a mapping", True),
     "two documents": (f"{ENTRY}    a: 1\n---\n{ENTRY}    b: 1\n", r"f, line \d = 'a second document'", False),
     "octal": (f"{ENTRY}    a: [1, 010]\n", r"f, line 3 = '/right/tried a 010': must be 10 or 8: ", False),

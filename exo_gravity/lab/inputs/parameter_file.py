@@ -24,8 +24,6 @@ from exo_gravity.core.params import joint_count
 from exo_gravity.lab.inputs import ros_yaml
 from exo_gravity.lab.inputs.ros_yaml import Nodes
 
-# Of recordings, whose parameters the recorder writes; libyaml is ten times faster than PyYAML alone.
-Loader = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
 RECORDED_TEXTS = 32  # remembered of a recording: more than it has nodes whose parameters are used
 
 
@@ -56,7 +54,10 @@ def load(path: str | Path) -> Nodes:
 def recorded_parameters(text: str, node: str) -> Mapping[str, Any]:
     """Return the parameters of `node` by name, from the text that the recorder wrote. Raises DataError."""
     try:
-        given = yaml.load(text, Loader)[node]["ros__parameters"]
+        # In libyaml's loader some 25,000 brackets in brackets would end the process; PyYAML's own one raises.
+        given = yaml.load(text, ros_yaml.EventLoader if len(text) < 10_000 else yaml.SafeLoader)[node][
+            "ros__parameters"
+        ]
         if {*map(type, given.keys())} <= {str}:
             return MappingProxyType(given)
     except (yaml.YAMLError, AttributeError, LookupError, TypeError, ValueError, RecursionError):

@@ -99,14 +99,12 @@ class _Reader:
 
     def _parameters(self, node: str, root: yaml.Node) -> dict[str, Any]:
         """Return the parameters of one node by their dotted names."""
-        found: dict[str, Any] = {}
-        for key, line, value in self._entries(node, root):
-            if key != PARAMETERS:
-                raise ParameterError(node, key, f"of the form {FORM} (line {line})")
-            found[key] = dict(self._flat(node, "", value, {}))
+        found = {key: (line, value) for key, line, value in self._entries(node, root)}
+        for key in found.keys() - {PARAMETERS}:
+            raise ParameterError(node, key, f"of the form {FORM} (line {found[key][0]})")
         if not found:
             raise ParameterError(node, {}, f"of the form {FORM}")
-        return dict(found[PARAMETERS])
+        return dict(self._flat(node, "", found[PARAMETERS][1], {}))
 
     def _flat(self, node: str, prefix: str, root: yaml.Node, lines: dict[str, int]) -> Iterator[tuple[str, Any]]:
         """Yield the dotted name and the value of each parameter. lines: those of the names so far."""
@@ -182,7 +180,11 @@ def read(text: str, source: str) -> Nodes:
     Raises ParameterError with the line of what is refused, yaml.YAMLError for what is not YAML.
     """
     reader = _Reader(source)
+    depth = 0
     for event in yaml.parse(text, EventLoader):
+        depth += isinstance(event, yaml.CollectionStartEvent) - isinstance(event, yaml.CollectionEndEvent)
+        if depth > 50:  # no parameter has 10; some 25,000 would end the process, in libyaml
+            reader.refuse(line_of(event), "brackets in brackets", "at most 50 within each other")
         if anchor := getattr(event, "anchor", None):
             sign = "*" if isinstance(event, yaml.AliasEvent) else "&"
             reader.refuse(line_of(event), f"{sign}{anchor}", "written out: ROS reads no anchors and aliases")
