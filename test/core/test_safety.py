@@ -331,6 +331,26 @@ ROWS: dict[str, Sequence[Step]] = {
         enable, wait(2.0), see(State.CHECKING), lambda arm: setattr(arm.machine, "hindrance", NO_REASON),
         until(State.PROVING, 0.1),
     ],
+    "the calm second passes while efforts are withheld, but for its end, which each gap restarts": [
+        let(effort=None), enable, wait(2.0), let(effort=EFFORT), wait(0.2), see(State.CHECKING),
+        let(effort=None), wait(), let(effort=EFFORT), wait(0.2), see(State.CHECKING), until(State.PROVING, 0.06),
+    ],
+    "without answers in time the calm second does not pass": [
+        let(effort=None, **TOO_LATE), enable, wait(2.0), let(effort=EFFORT, **FRESH), wait(0.9), see(State.CHECKING),
+        until(State.PROVING, 0.15),
+    ],
+    "an arm that swings beyond where it should hang is waited for, and no fault until it rests there": [
+        reads(1, position=0.7, velocity=0.15), enable, wait(2.0), see(State.CHECKING, words="at rest"),
+        reads(1, position=0.7), wait(0.1), see(fault="implausible_zero"),
+    ],
+    "no signs are proven before a start, and all of them in one that needs no proof": [
+        has(lambda arm: arm.machine.signs.progress == 0.0), enable, until(State.PROVING),
+        has(lambda arm: arm.machine.signs.progress == 1.0),
+    ],
+    "a trunk whose tilt arrives soon after the first efforts is still waited for": [
+        let(effort=None), enable, wait(2.0), let(effort=EFFORT), wait(0.2), leans(-1.57), wait(2.0),
+        see(State.CHECKING, words="near upright"),
+    ],
     **{
         f"a turn that an encoder loses while the loop stands still for {seconds} s in the proof is a fault": [
             enable, until(State.PROVING), wait(0.05), reads(1, position=TURN), stall(seconds), wait(0.1),

@@ -94,9 +94,7 @@ class SafetyMachine:
         self._rise = GuidedMotion(count)  # of the torque, where it begins
         self.pose = PoseQuestion(limits.joint_names)
         self.motion = MotionMonitor(limits)
-        self._switching = SwitchingOn(self.watch.replies)
-        self._switch_on = SwitchOnCheck(limits)
-        self.signs = SignCheck(limits.joint_names, self._none)
+        self.signs = SignCheck(limits.joint_names, limits.max_effort)
         self._left: Sequence[float] = ()  # Nm, what another process left the motors with
         self._attempts = 0  # to switch a motor on again that shows no torque while it is pushed
         #: Whether the last drive did not leave for each motor (n,), set from outside: that motor holds what it had.
@@ -275,19 +273,21 @@ class SafetyMachine:
                 return
             missing = Reason(missing.code, missing.reason)
         missing = missing or missing_of_trunk(limits, self.motion.trunk_tilt)
-        if not missing and (effort is None or are_late):
-            missing = Reason(Wait.EFFORTS, "effort commands")
         if not missing and not self._all_off:
             missing = Reason(Wait.MOTORS_OFF, "the motors to confirm that they are off")
-        if missing:
+        if missing or are_late:
             self._calm_since = self._now
+        if not missing and (effort is None or are_late):
+            missing = Reason(Wait.EFFORTS, "effort commands")
+            # While an IMU settles, the compensator answers in time without efforts.
+            self._calm_since = max(self._calm_since, self._now + START_GATE.efforts - START_GATE.calm)
         asks = not watch.trusted and limits.start_pose == CONFIRM
         patience = limits.enable_timeout + (HANGING_ARM.patience if asks else 0.0)
         if watch.fault:
             self.pose.withdraw()
         if asks:
             missing = self.pose.missing(self._now, watch.samples, missing)
-        # While the bridge cannot switch motors on, and while the operator looks at the arm, the calm second passes.
+        # It passes, too, while the bridge cannot switch motors on, and while the operator looks at the arm.
         self.waiting_for = self.hindrance or missing or Reason(Wait.CALM, f"{START_GATE.calm:g} s without a fault")
         is_calm = not (self.hindrance or missing) and self._now - self._calm_since >= START_GATE.calm
         if is_calm and effort is not None and not ride.is_riding:

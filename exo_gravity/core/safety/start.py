@@ -27,7 +27,8 @@ class StartGate:
     """What the readings must be before the motors are switched on."""
 
     at_rest: float = 0.1  #: rad/s; two to four codes of the 12-bit velocity
-    calm: float = 1.0  #: s without a fault: middleware and machine stutter while nodes start
+    calm: float = 1.0  #: s without a fault or late answers: middleware and machine stutter while nodes start
+    efforts: float = 0.25  #: s of these with efforts: the tilt that they need reaches the bridge by another way
 
 
 @dataclass(frozen=True)
@@ -104,6 +105,10 @@ def missing_for_a_start(
         low, high = math.degrees(limits.position_min[n]), math.degrees(limits.position_max[n])
         back = f"to be moved by {at_least(turn)} degrees, within its limits {low:.0f} to {high:.0f}"
         return Reason(Wait.JOINT_LIMITS, f"{limits.joint_names[n]} {back}")
+    if any(
+        abs(joint.velocity) > START_GATE.at_rest for joint in joints
+    ):  # an arm that swings is not where it will hang
+        return Reason(Wait.REST, "the arm to be at rest")
     if not zeros_are_trusted:
         zeros = zip(limits.joint_names, joints, limits.home, limits.home_tolerance, strict=True)
         for name, joint, home, tolerance in zeros:
@@ -114,8 +119,7 @@ def missing_for_a_start(
                     f"{joint.position:.3f} rad at the start, must be within {tolerance:g} of {home:g}: "
                     "bring the joint there by hand, or correct the parameter zero",
                 )
-    is_moving = any(abs(joint.velocity) > START_GATE.at_rest for joint in joints)
-    return Reason(Wait.REST, "the arm to be at rest") if is_moving else NO_REASON
+    return NO_REASON
 
 
 def missing_of_trunk(limits: Limits, tilt: float) -> Reason:
@@ -328,11 +332,10 @@ class SignCheck:
         self.damped = [False] * len(names)
         self.pushes = any(torque)
         self.done = not any(torque)
-        self.hint, self.progress = NO_REASON, 0.0
+        self.hint, self.progress = NO_REASON, float(self.done)
         self._names = names
         self._dt = 0.0
-        self._position = [math.nan] * len(names)  # rad
-        self._velocity = [math.nan] * len(names)  # rad/s
+        self._joints: Sequence[JointSample] = ()  # the newest readings
         self._still_at, self._still_for = [math.inf] * len(names), [0.0] * len(names)  # rad, and s without a push
         self._order = JointOrder(names)
         self._course = self._check_all(torque)
@@ -343,13 +346,12 @@ class SignCheck:
         joints: (n,) the newest readings.
         asked: (n,) Nm that the controller asks for in this pose.
         """
-        self._dt = dt
-        self._position, self._velocity = [joint.position for joint in joints], [joint.velocity for joint in joints]
-        for i, position in enumerate(self._position):
-            if self.effort[i] == 0.0 and abs(position - self._still_at[i]) <= SIGN_PUSH.still:
+        self._dt, self._joints = dt, joints
+        for i, joint in enumerate(joints):
+            if self.effort[i] == 0.0 and abs(joint.position - self._still_at[i]) <= SIGN_PUSH.still:
                 self._still_for[i] += dt
             else:
-                self._still_at[i], self._still_for[i] = position, 0.0
+                self._still_at[i], self._still_for[i] = joint.position, 0.0
         self._order.note(joints, asked)
         return next(self._course, None)
 
@@ -395,13 +397,13 @@ class SignCheck:
         yield from self._wait_for_rest(i)
         if not self.damped[i]:
             self._order.begin(i)
-        start, push, at_full, waited = self._position[i], 0.0, 0.0, 0.0
-        while not abs(moved := sign * (self._position[i] - start)) >= SIGN_PUSH.moved:
+        start, push, at_full, waited = self._joints[i].position, 0.0, 0.0, 0.0
+        while not abs(moved := sign * (self._joints[i].position - start)) >= SIGN_PUSH.moved:
             if at_full > SIGN_PUSH.timeout:
                 yield self._fault(i, f"{push:.2f} Nm did not move it: let it hang freely")
             if waited > SIGN_PUSH.patience:
                 return False
-            if abs(self._velocity[i]) > SIGN_PUSH.slow:
+            if abs(self._joints[i].velocity) > SIGN_PUSH.slow:
                 self._approach(i, 0.0, SIGN_PUSH.fall)
             else:
                 is_held = self.damped[i] or abs(self.effort[i]) < SIGN_PUSH.held * abs(push)
