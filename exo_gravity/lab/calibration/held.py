@@ -25,7 +25,7 @@ from exo_gravity.lab.calibration.poses import PRIOR
 
 POSES = 100  # new ones, at random
 LEAN = 0.15  # rad, standard deviation of the trunk's pitch and roll in these
-NORMAL = np.array([NormalDist().inv_cdf((number + 0.5) / 40.0) for number in range(40)])  # in place of random numbers
+NORMAL = np.array([NormalDist().inv_cdf((number + 0.5) / 400.0) for number in range(400)])  # in place of random numbers
 
 
 class InFile(NamedTuple):
