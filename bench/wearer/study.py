@@ -20,7 +20,7 @@ import numpy as np
 from exo_gravity.core.arm.interface import STANDARD_GRAVITY
 from exo_gravity.core.arm.paper import ArmModel
 from exo_gravity.core.arm.tilt import Tilt, gravity_in_trunk, turning_in_base
-from exo_gravity.core.compensation.compensator import JOINTS, Compensation, Compensator
+from exo_gravity.core.compensation.compensator import Compensation, Compensator
 from exo_gravity.core.compensation.settings import Settings
 from exo_gravity.core.errors import DataError
 from exo_gravity.core.numbers import NO_TORQUE, Torque
@@ -34,7 +34,7 @@ from exo_gravity.sim.trunk_motion import TrunkState
 from exo_gravity.sim.virtual_arm import TrunkReading
 from exo_gravity.sim.virtual_wearer import path_between
 
-from .devices import Worn, draw, turned
+from .devices import ARM, Worn, draw, turned
 
 RATE = 100.0  # Hz, of the control loop and the IMU
 DELAY = 2.0  # s until the wearer begins
@@ -220,7 +220,9 @@ def play(worn: Worn) -> Trial:
         return Tilt.of(worn.side, device.trunk.pitch, device.trunk.roll)
 
     wearer = Muscles(script, phases, worn.wearer, tilt, worn.seed)
-    limits = Limits(JOINTS, max_effort=worn.settings.max_effort, max_velocity=(20.0,) * 4, sign_check_torque=0.0)
+    limits = Limits(
+        ARM.joint_names, max_effort=worn.settings.max_effort, max_velocity=(20.0,) * 4, sign_check_torque=0.0
+    )
     compensator = Therapist(worn.settings, [DELAY + ends[2], DELAY + ends[4], DELAY + ends[7]])
     setup = ArmSetup(worn.side, device, worn.motors, limits, compensator.own, RATE, imu)
     trial = OfflineTrial(setup, script, DELAY, compensator, wearer)

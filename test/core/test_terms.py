@@ -19,7 +19,6 @@ from hypothesis import strategies as st
 
 from exo_gravity.core import ArmModel, Tilt
 from exo_gravity.core.arm.chain import least_inertia
-from exo_gravity.core.compensation.compensator import JOINTS
 from exo_gravity.core.compensation.terms.assist import ASSIST as TUNING
 from exo_gravity.core.compensation.terms.assist import Assist, AssistInput
 from exo_gravity.core.compensation.terms.catalogue import (
@@ -83,7 +82,7 @@ class TermsRun:
         )
         self.device = make_device(config=config)
         self.device.arm.reset(pose)
-        self.terms = Terms(JOINTS, settings.on_arm(LINKS), LINKS)
+        self.terms = Terms("abcd", settings.on_arm(LINKS), LINKS)
         self.energy: list[tuple[float, float]] = []
         self.positions = [self.device.arm.positions]
         self._sent = deque([(LINKS.torque(pose, UPRIGHT), NO_TORQUE)], max(1, round(delay / PERIOD)))

@@ -16,7 +16,6 @@ import can
 import numpy as np
 
 from exo_gravity.core.arm.wearer import Wearer
-from exo_gravity.core.compensation.compensator import JOINTS
 from exo_gravity.core.compensation.settings import Settings
 from exo_gravity.core.errors import BusError
 from exo_gravity.core.motors.ak import MIT
@@ -35,6 +34,7 @@ from exo_gravity.sim.rig import Rig
 from exo_gravity.sim.truth import TruthRecords
 from exo_gravity.sim.virtual_time import Wire
 
+from ..support import PARTS
 from ..support.copies import prepared
 from ..support.ports import own_ports
 from ..support.simulated_device import joints_of
@@ -44,7 +44,7 @@ REAL_RATE = 250.0  # Hz, of config/exo.yaml: how far a joint moves until a loss 
 CYCLE = 1.0 / RATE  # s
 MOTORS_OF_ARM = joints_of((MIT,) * 4)
 RATED, PEAK = (3.0, 9.0, 3.0, 3.0), (9.0, 18.0, 9.0, 9.0)  # Nm
-LIMITS = Limits(JOINTS, max_effort=RATED)
+LIMITS = Limits(PARTS, max_effort=RATED)
 CARRIED_IN = (0.0, 0.4, 0.2, 0.5)  # rad, in which the rated torques carry the arm of 75 kg
 POSE = (0.0, 0.6, 0.3, 0.3)  # rad, of the arm without a wearer
 SAFE_SPEED = 1.0  # rad/s
@@ -163,7 +163,7 @@ class CarriedArm(JudgedArm):
         tolerance = tuple(joint.spec.home_tolerance for joint in joints)
         channels = channels_of(channel, len(joints))
         usual = {"max_effort": peak, "home_tolerance": tolerance, "channels": channels}
-        kept = Limits(JOINTS, **{**usual, **(limits or {})})
+        kept = Limits(PARTS, **{**usual, **(limits or {})})
         wire = Wire(start=0.0, bitrate=bitrate, echoes=echoes)
         self.wires = {name: wire if name == channels[0] else Wire(wire.clock) for name in dict.fromkeys(channels)}
         self.on_bus = ArmOnWires(("wire", channel, {"fd": True} if is_fd else {}), joints, kept, 1.0 / rate, self.wires)

@@ -12,7 +12,6 @@ import pytest
 
 from exo_gravity.core import ArmModel
 from exo_gravity.core.arm.wearer import Wearer
-from exo_gravity.core.compensation.compensator import JOINTS
 from exo_gravity.core.compensation.terms.assist import Assist
 from exo_gravity.core.compensation.terms.catalogue import Friction, Inertia, Spring
 from exo_gravity.core.compensation.terms.terms import SUM, TermSettings
@@ -24,6 +23,7 @@ from exo_gravity.sim.arm import DEFAULT_LINKS
 from exo_gravity.sim.events import ACTS
 from exo_gravity.sim.script import TrialScript
 
+from ..support import PARTS
 from ..support.thorough import quick
 from .arms import PEAK, RATE, RATED, CarriedArm, raised_usual_arm, usual_arm
 
@@ -157,7 +157,7 @@ def test_a_fast_wearer_is_not_let_down(is_assisted):
     def assist(answer):
         """Push the way that the arm moves; the push fades towards 3.5 rad/s."""
         pushed = [math.copysign(4.0 * max(0.0, 1.0 - abs(v) / 3.5), v) for v in arm.device.arm.velocities]
-        arm.compensator.terms.assist.receive(arm.now, JOINTS, pushed, arm.now)
+        arm.compensator.terms.assist.receive(arm.now, PARTS, pushed, arm.now)
         return answer
 
     arm.controller.change = assist if is_assisted else None

@@ -12,7 +12,7 @@ import pytest
 
 from exo_gravity.core.arm.tilt import Tilt
 from exo_gravity.core.arm.wearer import Wearer
-from exo_gravity.core.compensation.compensator import JOINTS, Compensator
+from exo_gravity.core.compensation.compensator import Compensator
 from exo_gravity.core.compensation.settings import ModelError, Settings
 from exo_gravity.core.motors.ak import MIT
 from exo_gravity.core.safety.limits import Limits
@@ -22,6 +22,7 @@ from exo_gravity.sim import ArmConfig
 from exo_gravity.sim.arm import DEFAULT_LINKS
 from exo_gravity.sim.rig import Rig
 
+from ..support import PARTS
 from ..support.simulated_device import joints_of, make_device
 
 POSE = (0.0, 0.2, 0.0, 0.8)  # rad
@@ -45,12 +46,12 @@ def weigh(mass: float, **wearer: Any) -> tuple[Weighing, Rig]:
     device = make_device(config=ArmConfig(wearer_mass=SETTINGS.wearer_mass, wearer_cog=SETTINGS.wearer_cog))
     device.arm.carry(mass)
     device.arm.reset((0.0, 0.05, 0.05, 0.05))
-    limits = Limits(JOINTS, max_effort=SETTINGS.max_effort, sign_check_torque=0.0)
+    limits = Limits(PARTS, max_effort=SETTINGS.max_effort, sign_check_torque=0.0)
     arm = Rig(device, SETTINGS, joints_of((MIT,) * 4), limits, RATE)
     arm.carry()
     arm.act({"move": list(POSE), "over": MOVE}, wearer or {"hold": 20.0})
     arm.run(0.95 * MOVE)
-    weigher = Weigher(arm.compensator, JOINTS)
+    weigher = Weigher(arm.compensator, PARTS)
     assert weigher.begin(RATE) == "" and weigher.begin(RATE) == "a weighing is under way"
     weighing = weigher.weighing
     arm.forget()
@@ -75,7 +76,7 @@ def test_a_wearer_who_helps_with_one_joint_is_refused():
 
 def test_little_pushes_against_a_hand_that_moves_the_arm_and_not_for_long():
     compensator = Compensator(SETTINGS)
-    weigher, moved = Weigher(compensator, JOINTS), (0.0, 0.5, 0.0, 0.8)
+    weigher, moved = Weigher(compensator, PARTS), (0.0, 0.5, 0.0, 0.8)
     compensator.step(0.0, POSE, STILL)
     assert weigher.begin(RATE) == ""
     efforts = [
@@ -109,7 +110,7 @@ TROUBLE = {  # the arm's poses, its velocity, and what is said of it
 
 @pytest.mark.parametrize(("poses", "velocity", "said"), TROUBLE.values(), ids=TROUBLE)
 def test_an_arm_that_cannot_be_weighed_is_left_alone_with_what_would_be_right(poses, velocity, said):
-    weighing = Weighing(SETTINGS, JOINTS, RATE)
+    weighing = Weighing(SETTINGS, PARTS, RATE)
     torques = [weighing.torque(0.01, theta, velocity, TILT, STILL) for theta in poses]
     assert torques[-1] == STILL and weighing.result is None
     assert re.search(said, weighing.trouble) and weighing.text.startswith("not weighed: ")
@@ -129,11 +130,11 @@ def test_an_arm_that_cannot_be_weighed_is_left_alone_with_what_would_be_right(po
 )
 def test_what_would_hide_the_load_is_refused_before_anything_moves(changes, terms, rate, said):
     assert re.search(said, refusal(replace(SETTINGS, **changes), terms, rate))
-    assert Weighing(SETTINGS, JOINTS, rate).phase is WeighingPhase.TAKING_OVER  # made before the rate is known
+    assert Weighing(SETTINGS, PARTS, rate).phase is WeighingPhase.TAKING_OVER  # made before the rate is known
 
 
 def weighed(mass: float, pose: Sequence[float], empty: Weighed | None = None) -> Weighing:
-    weighing = Weighing(SETTINGS, JOINTS, RATE, empty)
+    weighing = Weighing(SETTINGS, PARTS, RATE, empty)
     weighing.torque(0.01, pose, STILL, TILT, STILL)
     weighing.result = Weighed(mass, 0.004, np.array(SETTINGS.unit_load.torque(pose, TILT)))
     return weighing

@@ -21,11 +21,11 @@ from exo_gravity.core.compensation.settings import Settings
 from exo_gravity.core.compensation.support import SupportRequest
 from exo_gravity.core.compensation.terms.terms import Terms, TermsInForce
 from exo_gravity.core.numbers import Torque, limited
+from exo_gravity.core.params import JOINT_NAMES
 from exo_gravity.core.trunk.inputs import TILT, FeltMotion, TiltInput
 from exo_gravity.core.vocabulary import NO_REASON, Reason, Withdrawal
 
 FALLBACK_TIME = 0.5  # s for which the chosen law must apply before it replaces the exact law again
-JOINTS = ("shoulder_rotation", "shoulder_abduction", "shoulder_flexion", "elbow_flexion")
 MAX_ANGLE = 26.0  # rad, more than an AK motor can report with any zero
 LONGEST_STEP = (
     0.01  # s that the rate limit allows for after a shorter one, so that the torque does not catch up at once
@@ -90,7 +90,7 @@ class Compensator:
     names: of the joints (n,), for the outer loop's input.
     """
 
-    def __init__(self, settings: Settings, names: Sequence[str] = JOINTS) -> None:
+    def __init__(self, settings: Settings, names: Sequence[str] = JOINT_NAMES.default) -> None:
         self.settings = settings
         self.terms = Terms(names, settings.terms, settings.moving)  #: what is added to gravity compensation
         #: of the trunk, or of the root link of another arm
