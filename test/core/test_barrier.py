@@ -19,9 +19,9 @@ from exo_gravity.core.safety.limits import DAMPING, DAMPING_RATE, MAX_EFFORT_RAT
 from exo_gravity.core.safety.shape import BARRIER, VIBRATION, Shaper
 
 from ..support import ROBOT
-from ..support.safety_run import LIMITS, PERIOD, reading
+from ..support.safety_run import LIMITS, reading
 
-NOTHING = (0.0,) * 4
+PERIOD = 0.004  # s
 WHOLE = (1.0,) * 4
 HEARD = (False,) * 4
 FULL = LIMITS.driven_speed + BARRIER.span  # rad/s
@@ -39,9 +39,9 @@ def joints(**changes: float) -> list[JointSample]:
 def test_a_motor_drives_no_joint_beyond_the_barrier_and_below_it_brakes_none(sign):
     effort = (sign * 3.0, sign * 9.0, sign * 0.5, sign * 5.0)  # the last one beyond `max_effort`, as a let-down may be
     for speed in np.arange(-4.0, 4.0, 0.1):
-        damping = barrier().damping(1.0, joints(velocity=sign * speed), HEARD, effort, NOTHING, is_late=False)
+        damping = barrier().damping(1.0, joints(velocity=sign * speed), HEARD, effort, NO_TORQUE, is_late=False)
         power = [speed * (abs(tau) - kd * speed) for tau, kd in zip(effort, damping, strict=True)]
-        assert damping == NOTHING or speed > LIMITS.driven_speed
+        assert damping == NO_TORQUE or speed > LIMITS.driven_speed
         assert max(power) <= 1e-9 or speed < FULL
 
 
@@ -55,7 +55,7 @@ def damped(rate: float, lag: float, inertia: float = 0.0036) -> np.ndarray:
     torque, speeds = 0.0, []
     for cycle in range(round(3.0 * rate)):
         asked = (min(DAMPING, DAMPING_RATE * cycle / rate),) * 4
-        damping = arm.damping(1.0 / rate, joints(velocity=filtered), HEARD, NOTHING, asked, is_late=False)
+        damping = arm.damping(1.0 / rate, joints(velocity=filtered), HEARD, NO_TORQUE, asked, is_late=False)
         for _ in range(round(1.0 / (rate * dt))):
             filtered += (speed - filtered) * dt / 0.02
             torque += (max(-9.0, min(9.0, -damping[3] * filtered)) - torque) * dt / lag
@@ -76,18 +76,18 @@ def test_only_what_turns_faster_than_people_shake_gets_less_damping(frequency, l
     arm = barrier()
     for cycle in range(100):
         speed = 0.5 * math.sin(2.0 * math.pi * frequency * 0.01 * cycle)
-        damping = arm.damping(0.01, joints(velocity=speed), HEARD, NOTHING, (DAMPING,) * 4, is_late=False)
+        damping = arm.damping(0.01, joints(velocity=speed), HEARD, NO_TORQUE, (DAMPING,) * 4, is_late=False)
     assert min(damping) == pytest.approx(least, abs=0.05)
     full = (DAMPING,) * 4
-    assert arm.damping(10.0, joints(velocity=0.0), HEARD, NOTHING, full, is_late=False) == full
+    assert arm.damping(10.0, joints(velocity=0.0), HEARD, NO_TORQUE, full, is_late=False) == full
 
 
 def test_what_vibrates_without_damping_keeps_its_own_and_the_brake_of_a_driven_joint_stays():
     arm, tau = barrier(), (3.0,) * 4
-    for asked, speed, effort, dt in ((NOTHING, 0.0, NOTHING, 0.01), ((DAMPING,) * 4, FULL, tau, 0.1)):
+    for asked, speed, effort, dt in ((NO_TORQUE, 0.0, NO_TORQUE, 0.01), ((DAMPING,) * 4, FULL, tau, 0.1)):
         for cycle in range(100):
             way = (-1.0) ** (cycle // 4)
-            arm.damping(0.01, joints(velocity=0.5 * way), HEARD, NOTHING, asked, is_late=False)
+            arm.damping(0.01, joints(velocity=0.5 * way), HEARD, NO_TORQUE, asked, is_late=False)
         damping = arm.damping(dt, joints(velocity=speed), HEARD, effort, (DAMPING,) * 4, is_late=False)
         assert damping == (DAMPING,) * 4 if not any(asked) else min(damping) >= 3.0 / FULL - 1e-9
 
@@ -96,16 +96,16 @@ def test_what_vibrates_without_damping_keeps_its_own_and_the_brake_of_a_driven_j
 def test_while_a_motor_is_late_no_other_drives_its_joint_and_the_brake_ends_with_it(sign):
     arm, effort = barrier(), (sign * 2.0,) * 4
     for speed, power in ((BARRIER.calm, 0.5), (BARRIER.still, 0.0), (-1.0, -2.0)):
-        damping = arm.damping(1.0, joints(velocity=sign * speed), HEARD, effort, NOTHING, is_late=True)
+        damping = arm.damping(1.0, joints(velocity=sign * speed), HEARD, effort, NO_TORQUE, is_late=True)
         assert [speed * (2.0 - kd * speed) for kd in damping] == pytest.approx([power] * 4, abs=1e-9)
-    assert arm.damping(1.0, joints(velocity=sign), HEARD, effort, NOTHING, is_late=False) == NOTHING
+    assert arm.damping(1.0, joints(velocity=sign), HEARD, effort, NO_TORQUE, is_late=False) == NO_TORQUE
 
 
 def test_the_brake_grows_without_a_step_and_falls_slowly():
     arm, effort, brakes = barrier(), (3.0, 9.0, 3.0, 3.0), []
     rising = np.arange(0.0, 3.0, 0.01)
     for speed in (*rising, *rising[::-1]):
-        brakes.append(arm.damping(PERIOD, joints(velocity=float(speed)), HEARD, effort, NOTHING, is_late=False)[1])
+        brakes.append(arm.damping(PERIOD, joints(velocity=float(speed)), HEARD, effort, NO_TORQUE, is_late=False)[1])
     assert max(brakes) > 3.0
     assert np.abs(np.diff(brakes)).max() < 0.35
     assert brakes[len(rising) + 155] > 0.01  # 1.44 rad/s on the way down, below `driven_speed`
@@ -115,7 +115,7 @@ def test_the_brake_grows_without_a_step_and_falls_slowly():
 def test_the_brake_leads_a_joint_that_speeds_up_by_as_much_at_any_rate(rate):
     arm, acceleration, dt = barrier(), 10.0, 1.0 / rate  # rad/s^2, s
     for speed in np.arange(0.0, 2.0, acceleration * dt):
-        brake = arm.damping(dt, joints(velocity=float(speed)), HEARD, (3.0,) * 4, NOTHING, is_late=False)[0]
+        brake = arm.damping(dt, joints(velocity=float(speed)), HEARD, (3.0,) * 4, NO_TORQUE, is_late=False)[0]
     led = speed + acceleration * BARRIER.lead - LIMITS.driven_speed
     assert brake == pytest.approx(3.0 / FULL * led / BARRIER.span, rel=1e-3)
 
@@ -123,7 +123,7 @@ def test_the_brake_leads_a_joint_that_speeds_up_by_as_much_at_any_rate(rate):
 def test_the_speed_of_a_motor_that_does_not_reply_bounds_nothing():
     asked = (DAMPING,) * 4
     mute, bounded = (False, False, True, True), (1.0, 3.0, DAMPING, DAMPING)
-    assert barrier().damping(1.0, joints(velocity=3.0), mute, NOTHING, asked, is_late=False) == bounded
+    assert barrier().damping(1.0, joints(velocity=3.0), mute, NO_TORQUE, asked, is_late=False) == bounded
     assert barrier().damping(1.0, [UNKNOWN] * 4, (True,) * 4, (1.0,) * 4, asked, is_late=False) == asked
 
 
@@ -142,7 +142,7 @@ def test_a_wall_pushes_back_before_a_joint_limit():
     low, high = LIMITS.position_min[3], LIMITS.position_max[3]
     for position, sign in ((low + 0.05, 1), (high - 0.05, -1)):
         arm = barrier()
-        effort, damping = arm.shape(1.0, joints(position=position), NOTHING, WHOLE, NOTHING, is_guided=False)
+        effort, damping = arm.shape(1.0, joints(position=position), NO_TORQUE, WHOLE, NO_TORQUE, is_guided=False)
         assert effort[3] == pytest.approx(sign * 1.25) and damping[3] == 5.0
         assert "soft wall (d)" in arm.acted
 

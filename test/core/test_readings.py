@@ -17,12 +17,12 @@ from exo_gravity.core.motors.joint_motor import UNKNOWN, JointSample
 from exo_gravity.core.safety.start import SwitchOnCheck
 from exo_gravity.core.safety.watch import ArmWatch, JointWatch, Power, PowerChange
 
-from ..support.safety_run import LIMITS, PERIOD, reading
+from ..support.safety_run import LIMITS, reading
 from ..support.thorough import quick
 
 SPEC = MOTORS["AK80-9"]
 CODE = 2.0 * SPEC.velocity_range / 4095.0  # rad/s of the velocity on the wire
-STEP = 0.001  # s
+STEP, PERIOD = 0.001, 0.004  # s
 
 
 def resting(now: float) -> float:

@@ -15,7 +15,7 @@ from exo_gravity.core.safety.machine import SafetyMachine
 
 from .simulated_device import OFF
 
-PERIOD = 0.004  # s
+PERIOD = 0.008  # s, half as many cycles as a real bus has show the same
 LIMITS = Limits(
     joint_names=("a", "b", "c", "d"),
     position_min=(-1.6, -0.2, -0.8, -0.2),
@@ -40,11 +40,12 @@ class SafetyRun:
     switched off behind the machine's back. effort: Nm, with `effort_age` in s; damped: as while the load changes; held:
     as of a late tilt. drive: the machine's last output. applied: (4,) Nm, what the motors truly apply; a silent motor
     keeps its torque. steps: its largest step per cycle. while_hanging: Nm, asked for in place of `effort` while the
-    start is checked.
+    start is checked. period: s of a cycle.
     """
 
-    def __init__(self, **limits: Any) -> None:
-        self.machine = SafetyMachine(replace(LIMITS, **limits), PERIOD)
+    def __init__(self, period: float = PERIOD, **limits: Any) -> None:
+        self.period = period
+        self.machine = SafetyMachine(replace(LIMITS, **limits), period)
         self.now = 100.0
         self.changes: list[dict[str, Any]] = [{} for _ in range(4)]
         self.effort: Sequence[float] | None = EFFORT
@@ -59,8 +60,8 @@ class SafetyRun:
 
     def cycle(self, seconds: float = PERIOD) -> SafetyRun:
         """Run the machine for `seconds`, at least one cycle."""
-        for _ in range(max(1, round(seconds / PERIOD))):
-            self.now += PERIOD
+        for _ in range(max(1, round(seconds / self.period))):
+            self.now += self.period
             for i, change in enumerate(self.changes):
                 if i not in self.silent:
                     damped = self.applied[i] - self.drive.damping[i] * change.get("velocity", 0.0)
