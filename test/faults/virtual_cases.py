@@ -482,12 +482,8 @@ START = (
 )
 EFFORTS = (
     FaultCase("compensator frozen, the rest runs on", freeze, ALONE, clear=resume, outcomes=("command_stale",)),
-    FaultCase("effort NaN", happens("efforts_nan"), COMMANDED),
     FaultCase("NaN joint states", unknown_states, PAPER, outcomes=("command_withdrawn",)),
-    FaultCase("NaN tilt", lambda rig: setattr(rig, "imu_frozen", TrunkReading((math.nan,) * 3)), PAPER,
-        limit=PROCESS_REACTION, outcomes=("command_withdrawn",)),
     FaultCase("impossible parameters", set_impossible_parameters, PAPER, limit=None, outcomes=("active",)),
-    FaultCase("no efforts", happens("efforts_withdrawn"), COMMANDED),
     FaultCase("efforts oscillate at 8 Hz",
         second(lambda now, effort: effort + TREMOR * math.sin(16.0 * math.pi * now)), MONITORED, limit=0.5,
         outcomes=UNEXPLAINED),
@@ -542,6 +538,11 @@ FIRMWARE = (
 )
 # Further values of what another row shows: thorough.
 FURTHER = (
+    # Efforts and tilts that are no number, and efforts that are withdrawn: test_safety.py, test_tilt.py.
+    FaultCase("effort NaN", happens("efforts_nan"), COMMANDED),
+    FaultCase("NaN tilt", lambda rig: setattr(rig, "imu_frozen", TrunkReading((math.nan,) * 3)), PAPER,
+        limit=PROCESS_REACTION, outcomes=("command_withdrawn",)),
+    FaultCase("no efforts", happens("efforts_withdrawn"), COMMANDED),
     # The steps are the firmware's own; test_motors.py judges the return.
     *map(stopped, (40, 60, 75)),
     FaultCase("bus silent for 3 s", in_turn(SILENCE, pause(3.0), END_SILENCE), PAPER, unreached=ALL_JOINTS,

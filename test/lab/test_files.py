@@ -25,7 +25,6 @@ from exo_gravity.sim.params import SIMULATOR
 from exo_gravity.sim.script import TrialScript
 
 from ..support import DATA
-from ..support.thorough import quick
 from ..support.urdf_oracle import MujocoArm
 
 POSES = {
@@ -43,7 +42,8 @@ def script_to(pose: list[float]) -> TrialScript:
     return TrialScript.parse({"name": "raise", "steps": [{"move": pose, "over": 3.0}, {"hold": 3.0}]})
 
 
-@pytest.mark.parametrize("name", quick(["three_joints"], POSES))
+@pytest.mark.thorough  # `make test` carries one in test_motors.py, and plays a script of another one below
+@pytest.mark.parametrize("name", POSES)
 def test_an_arm_that_ships_is_raised_by_its_wearer_and_stays(name: str) -> None:
     params, script = packaged_config(f"{name}.yaml"), script_to(POSES[name])
     (trial,) = simulated_trials(params, script)

@@ -452,13 +452,13 @@ def operated(node):
 
 
 def test_an_arm_is_let_down_gently_when_its_operator_is_gone_but_not_after_a_release(operated):
-    operated.run(1.5)
-    operated.run(2.0, holding="anna")
+    operated.run(LEASE_TIME + 0.2)
+    operated.run(0.5, holding="anna")
     assert operated.operator.lease.holder == "anna"
     operated.operator.lease.request(operated.arm.clock.monotonic(), "anna", "release")
-    operated.run(2.0)
+    operated.run(LEASE_TIME + 0.3)
     assert operated.safety.state is State.ACTIVE and not operated.safety.fault
-    operated.run(1.0, holding="anna")
+    operated.run(0.5, holding="anna")
     operated.run(LEASE_TIME - 0.2)
     assert operated.safety.state is State.ACTIVE
     operated.run(0.5)

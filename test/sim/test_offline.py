@@ -126,7 +126,7 @@ def test_steps_of_the_trunk_have_an_angle_or_only_a_duration_and_one_of_the_hand
         (b"name: x\nsteps:\n  - {hold: 1.0}\nsteps:\n  - {hold: 2.0}\n", "steps is given twice"),
         (b"name: x\nsteps: [{hold: 1.0, hold: 30.0}]\n", "hold is given twice"),
         (b"\xff\xfe", "decode"),
-        (b"[" * 1500, "depth"),
+        (b"[\n" * 1500, "depth"),
         (None, "No such file"),
     ],
 )

@@ -504,7 +504,7 @@ NAMED = {
     "law": with_text(PARAMETERS, "/right/compensator:\n  ros__parameters: {law: a: b}\n", LEFT_OUT),
     "no mapping": with_text(PARAMETERS, "/right/compensator:\n  ros__parameters: 1\n", LEFT_OUT),
     "no parameters": with_text(PARAMETERS, "/right/compensator", LEFT_OUT),
-    "parameters nested too deep": with_text(PARAMETERS, "/right/compensator: " + "[" * 100_000, LEFT_OUT),
+    "parameters nested too deep": with_text(PARAMETERS, "/right/compensator: " + "[\n" * 50_000, LEFT_OUT),
     **{
         values: with_text(PARAMETERS, f"/right/{node}: {{ros__parameters: {values}}}", LEFT_OUT)
         for node, values in (

@@ -60,18 +60,18 @@ def guess() -> TorqueGuess:
 
 @pytest.fixture(scope="module")
 def wrong_file():
-    """A tour of three poses of an arm whose masses, centres of gravity and torque scales differ from the file's."""
+    """A tour of two poses of an arm whose masses, centres of gravity and torque scales differ from the file's."""
     links = DEFAULT_LINKS
     truth = ArmModel(links.length, links.cog * 0.9, links.mass * (1.2, 0.8, 1.15, 0.8))
     motors = [replace(motor, torque_scale=scale) for motor, scale in zip(MOTORS_AS_MOUNTED, SCALES, strict=True)]
     run = TourRun(truth=ArmConfig(truth), motors=motors, rate=RATE)
-    return run, run.run(Itinerary(LIMITS, 3, 60.0)), truth
+    return run, run.run(Itinerary(LIMITS, 2, 45.0)), truth
 
 
-def test_a_tour_of_three_poses_is_slow_ends_hanging_in_time_and_does_not_watch_the_bridge_let_the_arm_down(wrong_file):
+def test_a_tour_of_two_poses_is_slow_ends_hanging_in_time_and_does_not_watch_the_bridge_let_the_arm_down(wrong_file):
     run, tour, _ = wrong_file
-    assert tour.trouble == "" and tour.done and len(tour.measured) == 3
-    assert tour.elapsed < 70.0
+    assert tour.trouble == "" and tour.done and len(tour.measured) == 2
+    assert tour.elapsed < 55.0
     assert run.safety.fault is None and run.safety.state is State.DISABLED and not run.safety.acted
     positions = np.array(run.log)[:, 1:5]
     np.testing.assert_allclose(positions[-1], LIMITS.home, atol=0.1)
