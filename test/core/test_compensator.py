@@ -164,6 +164,15 @@ def test_where_the_velocity_is_not_known_a_change_takes_longer_and_settings_that
     assert not run.cycle(GUIDANCE.watch + 0.2, velocity=None).remainder
 
 
+def test_a_low_limit_of_the_torques_rate_makes_no_torque_of_a_moving_arm_false():
+    run = CompensatorRun(max_effort_rate=1.0)
+    run.cycle()
+    for n in range(250):
+        theta = np.add(THETA, n * PERIOD)
+        run.cycle(theta=theta, velocity=(1.0,) * 4)
+    assert run.efforts[-1] == pytest.approx(gravity_torque(ROBOT, theta), abs=1e-9)
+
+
 def test_too_large_a_torque_is_clamped_and_the_joint_named():
     run = CompensatorRun(max_effort=(3.0, 1.0, 3.0, 3.0))
     answer = run.cycle(2.0)

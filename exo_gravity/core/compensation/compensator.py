@@ -171,8 +171,12 @@ class Compensator:
         if not change.is_over:
             torque = change.follow(dt, velocity, needs, torque)
         self._torque, self._last = torque, at
-        most = s.max_effort_rate * min(dt, LONGEST_STEP)
-        self._effort = tuple([limited(wanted, last, most) for wanted, last in zip(torque, self._effort, strict=True)])
+        # Over 1 rad gravity's torque changes by its amplitude: a lower limit would make that of a moving arm false.
+        turn, step = sum(map(abs, velocity or ())), min(dt, LONGEST_STEP)
+        self._effort = tuple([
+            limited(new, last, step * (s.max_effort_rate + turn * most))
+            for new, last, most in zip(torque, self._effort, s.max_effort, strict=True)
+        ])  # fmt: skip
         over = tuple([n for n, most in enumerate(s.max_effort) if not -most <= gravity[n] <= most])
         remainder = () if change.is_over else change.remainder
         return Compensation(self._effort, NO_REASON, over, self._fallback, remainder, change.is_large, late_tilt)

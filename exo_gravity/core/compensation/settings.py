@@ -125,7 +125,7 @@ class Settings:
     wearer_moments: Sequence[Sequence[float]] = ()
     tissue: Springs = field(default_factory=Springs)  #: of the wearer's relaxed joints
     max_effort: Sequence[float] = owned((3.0, 9.0, 3.0, 3.0), "torque limit per joint", (0.0, LARGEST_EFFORT), "Nm")
-    max_effort_rate: float = owned(50.0, "fastest change of torque", (1.0, 1000.0), "Nm/s", expert=True)
+    max_effort_rate: float = owned(50.0, "fastest change of torque at rest", (1.0, 1000.0), "Nm/s", expert=True)
     tilt_timeout: float = owned(
         0.08, "age of the trunk tilt at which the efforts are withdrawn", (0.01, 0.5), "s", expert=True
     )
