@@ -185,10 +185,10 @@ def test_the_lifting_of_a_load_is_no_drop():
     fast = (2.5 * velocity).tolist()
     run.compensator.applied = (0.0,) * 4  # motors that are off carry nothing
     run.cycle(0.1, velocity=fast)
-    assert run.compensator.dropped == 0.0
+    assert not run.compensator.lost
     run.compensator.applied = run.efforts[-1]
     run.cycle(0.1, velocity=fast)
-    assert run.compensator.dropped == 2.0
+    assert run.compensator.lost == {"payload.mass": 0.0}
     assert math.isclose(run.compensator.settings.arm.total_mass, settings_with().arm.total_mass)
 
 

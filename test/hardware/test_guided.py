@@ -168,4 +168,9 @@ def test_a_fast_wearer_is_not_let_down(is_assisted):
         arm.cycle()
         columns = zip(arm.safety.motion.impulse, arm.safety.motion.full, strict=True)
         largest += [impulse / (MOTION.patience * full) for impulse, full in columns if full]
-    assert not arm.fault and 3.0 < np.abs(arm.records["velocity"]).max() < 5.0 and max(largest) < 0.5
+    assert (
+        not arm.fault
+        and 3.0 < np.abs(arm.records["velocity"]).max() < 5.0
+        and max(largest) < 0.5
+        and not arm.compensator.lost
+    )

@@ -9,14 +9,16 @@ applies it (core/safety/guidance.py).
 
 import math
 import operator
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
 from typing import NamedTuple, Protocol
 
+import numpy as np
+
 from exo_gravity.core.arm.interface import MAX_PAYLOAD, STANDARD_GRAVITY
 from exo_gravity.core.arm.tilt import AXES, Tilt
-from exo_gravity.core.compensation.guidance import DROP, PAUSE, DropWatch, GuidedChange
+from exo_gravity.core.compensation.guidance import DROP, PAUSE, DropWatch, GuidedChange, TouchWatch
 from exo_gravity.core.compensation.settings import Settings
 from exo_gravity.core.compensation.support import SupportRequest
 from exo_gravity.core.compensation.terms.terms import Terms, TermsInForce
@@ -98,7 +100,7 @@ class Compensator:
         self.support_request = SupportRequest()  #: used with `support_adapts` in zero_g
         self.motion = FeltMotion()  #: of the trunk, used with `inertial` while the tilt is fresh
         self.applied: Sequence[float] | None = None  #: (n,) Nm, the motors' measured torque, set by who knows it
-        self.dropped = 0.0  #: kg, the load that left the hand last; 0 for none
+        self.lost: Mapping[str, object] = {}  #: what changed of the settings as the load was lost last, by parameter
         self._client: Client | None = None  # the last one
         self._most_asked: Sequence[float] = ()  # (n,) Nm, that it may ask for; () before its first call
         self._pending: Settings | None = None
@@ -106,7 +108,7 @@ class Compensator:
         self._effort = self._torque  # of its rate,
         self._last = Reading(-math.inf, (), None, self.tilt.at(0.0))  # that it answers
         self._change: GuidedChange[Load] = GuidedChange(len(settings.max_effort))
-        self._drop_watch = DropWatch()
+        self._drop_watch, self._touch_watch = DropWatch(), TouchWatch()
         self._fallback = ""  # why the exact law replaces the chosen one
         self._fallback_until = -math.inf
 
@@ -177,6 +179,8 @@ class Compensator:
             limited(new, last, step * (s.max_effort_rate + turn * most))
             for new, last, most in zip(torque, self._effort, s.max_effort, strict=True)
         ])  # fmt: skip
+        if velocity and self.applied and s.mode == "zero_g":
+            self._withdraw_from_empty(at, velocity, self.applied)
         over = tuple([n for n, most in enumerate(s.max_effort) if not -most <= gravity[n] <= most])
         remainder = () if change.is_over else change.remainder
         return Compensation(self._effort, NO_REASON, over, self._fallback, remainder, change.is_large, late_tilt)
@@ -244,8 +248,20 @@ class Compensator:
                 return
         speed = sum(map(operator.mul, per_mass, velocity))
         if self._drop_watch.step(at.time - self._last.time, speed, s.payload.mass):
-            self.dropped = s.payload.mass
+            self.lost = {"payload.mass": 0.0}
             self._pending = replace(self._pending or s, payload=s.payload._replace(mass=0.0))
+
+    def _withdraw_from_empty(self, at: Reading, velocity: Sequence[float], applied: Sequence[float]) -> None:
+        """Carry the robot alone once nothing touches it."""
+        robot = self.settings.empty
+        weight, _ = robot.torque(at.theta, at.tilt, exact=True)
+        momentum, coriolis = robot.moving.links.momentum(at.theta, velocity)
+        known = np.add(applied, coriolis) - weight
+        carried, lacking = np.subtract(self._effort, weight), np.subtract(self._effort, applied)
+        speed = max(map(abs, velocity))
+        if self._touch_watch.step(at.time, speed, np.array(momentum), known, carried, lacking):
+            self.lost = {"mode": "one_g", "payload.mass": 0.0}
+            self._pending = robot
 
     def _law(self, at: Reading) -> Torque:
         """Return the torque of the chosen law, or of the exact law while the chosen one does not apply."""

@@ -10,6 +10,8 @@ from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from typing import Generic, TypeVar
 
+import numpy as np
+
 from exo_gravity.core.numbers import Torque
 from exo_gravity.core.safety.guidance import GUIDANCE, GuidedMotion
 
@@ -52,6 +54,71 @@ class DropWatch:
         self._slow += min(1.0, dt / DROP.low_pass) * (speed - self._slow)
         is_sudden = speed > 0.0 and speed - self._slow > DROP.rise
         return mass > DROP.least_mass and (speed > DROP.speed or is_sudden)
+
+
+@dataclass(frozen=True)
+class TouchLimits:
+    """By what it shows that nothing touches the robot."""
+
+    bandwidth: float = 80.0  #: 1/s, of the momentum observer
+    heavy: float = 0.8  #: Nm beyond the robot's weight, from which on a joint tells,
+    joints: int = 2  #: and so many must: one alone is free where a wearer begins to lift the arm
+    share: float = 0.3  #: of that,
+    least: float = 0.2  #: and Nm, that friction and errors of the model may look like
+    time: float = 0.1  #: s for which no joint is touched; 0.05 is the longest of 500 reaches and other motions
+    slow: float = 1.0  #: rad/s, up to which motors that apply what is asked of them show it; faster ones are braked
+
+
+TOUCH = TouchLimits()
+
+
+class TouchWatch:
+    """Whether nothing touches the robot although its motors carry more than itself: the arm has left the cuff.
+
+    A person's arm presses on the robot by what the motors carry of it, less what moves it. A momentum observer (De Luca
+    et al., IROS 2006) tells from the motors' torque and the motion what presses on each joint. People who reach, wave
+    or push free all joints at once for a moment at most; an empty robot is free for ever.
+    """
+
+    def __init__(self) -> None:
+        self._time = -math.inf
+        self._is_applied = False  # whether the motors apply what is asked of them, but for the brake
+        self._free_for = 0.0  # s
+        # (n,): what touches the robot, and what else changes its momentum, in Nm; and the momentum without errors
+        self._touch = self._known = self._passed = np.zeros(0)
+
+    def step(
+        self,
+        now: float,
+        speed: float,
+        momentum: np.ndarray,
+        known: np.ndarray,
+        carried: np.ndarray,
+        lacking: np.ndarray,
+    ) -> bool:
+        """Return whether nothing touches the robot at `now` s.
+
+        speed: rad/s of the fastest joint. momentum: of the robot, (n,) kg m^2/s.
+        known: (n,) Nm, by which the motors, the robot's weight and its motion change the momentum.
+        carried: (n,) Nm, what is asked of the motors beyond the robot's weight.
+        lacking: (n,) Nm, what is asked of them and not applied.
+        """
+        dt, gain = now - self._time, TOUCH.bandwidth
+        if dt <= PAUSE:
+            self._passed = self._passed + dt * (self._known + self._touch)
+            self._touch = gain * (momentum - self._passed)
+        else:
+            dt, self._touch, self._is_applied = 0.0, -carried, False
+            self._passed = momentum - self._touch / gain
+        self._time, self._known = now, known
+        allowed = TOUCH.share * np.abs(carried) + TOUCH.least
+        is_loaded = np.sum(np.abs(carried) >= TOUCH.heavy) >= TOUCH.joints
+        is_applied = bool(is_loaded and np.all(np.abs(lacking) <= allowed))
+        if speed <= (TOUCH.slow if is_applied else GUIDANCE.calm):
+            self._is_applied = is_applied
+        is_free = self._is_applied and is_loaded and np.all(np.abs(self._touch) <= allowed)
+        self._free_for = self._free_for + dt if is_free else 0.0
+        return self._free_for >= TOUCH.time
 
 
 Load = TypeVar("Load")

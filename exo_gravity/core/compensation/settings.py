@@ -209,6 +209,11 @@ class Settings:
         return arm.with_wearer(self.wearer_mass, self.wearer_cog, support)
 
     @cached_property
+    def empty(self) -> "Settings":
+        """The same for the robot alone."""
+        return replace(self, mode="one_g", payload=NO_LOAD)
+
+    @cached_property
     def unit_load(self) -> Arm:
         """A load of 1 kg in the hand, without an arm, where gravity is 1 m/s^2.
 

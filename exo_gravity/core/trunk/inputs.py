@@ -42,9 +42,9 @@ class TiltLimits:
     #: stays within it; neither a jump nor many small ones in a row do
     jump: float = 0.1
     #: rad/s; the torque follows a faster turn as a guided motion: a fall, or an IMU that comes loose. A bow of 30
-    #: degrees in a second is slower. With 0.05 an IMU that slips by 30 degrees at 0.1 to 0.74 rad/s drives an arm at
-    #: 1.1 rad/s, not at 4.1; but joints are not held while torque is guided, and an arm that leaves the cuff in a lean
-    #: of 20 degrees then reaches 2.6 rad/s with 7.6 J, and stays up, where it reaches 1.35 with 0.9 and is let down
+    #: degrees in a second is slower. With 0.05 an IMU that slips by 30 degrees at 0.2 to 0.74 rad/s drives an arm at
+    #: 0.4 rad/s, not at 2.6; but then the arm of a wearer who leans by 20 degrees in 1 s and reaches sinks by 28
+    #: degrees once they relax, driven at up to 1.2 rad/s, where it stays at rest
     followed: float = 0.75
     ahead: float = 0.05  #: rad, once the tilt is so far ahead of one that turns no faster
     #: s by which a stamp may be ahead of our clock: /clock comes in steps, hosts differ by ms. A clock that goes fast

@@ -179,7 +179,7 @@ class CompensatorNode(Node):
         self._answer, self._last_answer = answer, now
         if changed:
             self._changes.append(answer)
-        if changed or self._control.dropped:
+        if changed or self._control.lost:
             self._changed.trigger()
         return efforts
 
@@ -242,10 +242,11 @@ class CompensatorNode(Node):
         }
 
     def _report_changes(self) -> None:
-        if self._control.dropped:
-            dropped, self._control.dropped = self._control.dropped, 0.0
-            self.get_logger().warning(f"the load of {dropped:g} kg has left the hand: payload.mass is set to 0")
-            self.set_parameters([Parameter("payload.mass", value=0.0)])
+        if self._control.lost:
+            lost, self._control.lost = self._control.lost, {}
+            where = "the cuff: is an arm in it?" if "mode" in lost else "the hand:"
+            self.get_logger().warning(f"the load has left {where} Set now: {lost}")
+            self.set_parameters([Parameter(name, value=value) for name, value in lost.items()])
         while self._changes:
             self._report(self._changes.popleft())
 
