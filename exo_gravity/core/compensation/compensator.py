@@ -253,15 +253,15 @@ class Compensator:
 
     def _withdraw_from_empty(self, at: Reading, velocity: Sequence[float], applied: Sequence[float]) -> None:
         """Carry the robot alone once nothing touches it."""
-        robot = self.settings.empty
-        weight, _ = robot.torque(at.theta, at.tilt, exact=True)
-        momentum, coriolis = robot.moving.links.momentum(at.theta, velocity)
+        s = self.settings
+        weight = s.sprung(s.robot.torque(at.theta, at.tilt), at.theta)
+        momentum, coriolis = (s.robot_by_mass or s.robot).links.momentum(at.theta, velocity)
         known = np.add(applied, coriolis) - weight
         carried, lacking = np.subtract(self._effort, weight), np.subtract(self._effort, applied)
         speed = max(map(abs, velocity))
         if self._touch_watch.step(at.time, speed, np.array(momentum), known, carried, lacking):
             self.lost = {"mode": "one_g", "payload.mass": 0.0}
-            self._pending = robot
+            self._pending = replace(s, mode="one_g", payload=s.payload._replace(mass=0.0))
 
     def _law(self, at: Reading) -> Torque:
         """Return the torque of the chosen law, or of the exact law while the chosen one does not apply."""

@@ -209,11 +209,6 @@ class Settings:
         return arm.with_wearer(self.wearer_mass, self.wearer_cog, support)
 
     @cached_property
-    def empty(self) -> "Settings":
-        """The same for the robot alone."""
-        return replace(self, mode="one_g", payload=NO_LOAD)
-
-    @cached_property
     def unit_load(self) -> Arm:
         """A load of 1 kg in the hand, without an arm, where gravity is 1 m/s^2.
 
@@ -249,11 +244,13 @@ class Settings:
             return held(lambda links: self._of_links(law, links, tilt), theta, self.joint_stiffness), reason
         return self._of_links(law, theta, tilt), reason
 
+    def sprung(self, torque: Torque, theta: Sequence[float]) -> Torque:
+        """Return `torque` (n,) in Nm with that of the robot's own springs at `theta` (n,) rad."""
+        return tuple(map(operator.add, torque, self.joint_spring.torque(theta))) if self.joint_spring.on else torque
+
     def _of_links(self, law: Law, theta: Sequence[float], tilt: Tilt) -> Torque:
         """Return the torque (n,) in Nm by `law` with all springs for links at `theta` (n,) rad."""
-        torque = law.torque(theta, tilt)
-        if self.joint_spring.on:
-            torque = tuple(map(operator.add, torque, self.joint_spring.torque(theta)))
+        torque = self.sprung(law.torque(theta, tilt), theta)
         if self.mode == "zero_g" and self.tissue.on:
             share = self.support_now
             torque = tuple([tau + share * own for tau, own in zip(torque, self.tissue.torque(theta), strict=True)])
