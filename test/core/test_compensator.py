@@ -15,7 +15,7 @@ from exo_gravity.core.arm.springs import Springs
 from exo_gravity.core.arm.tilt import Tilt
 from exo_gravity.core.arm.wearer import TISSUE_REACH, Wearer
 from exo_gravity.core.compensation.compensator import Compensator
-from exo_gravity.core.compensation.guidance import CommandFade, GuidedChange
+from exo_gravity.core.compensation.guidance import TOUCH, CommandFade, GuidedChange, TouchWatch
 from exo_gravity.core.compensation.support import NAME, REQUEST
 from exo_gravity.core.compensation.terms.catalogue import Spring
 from exo_gravity.core.compensation.terms.terms import TermSettings
@@ -152,6 +152,22 @@ def test_while_the_trunk_turns_and_the_joints_move_the_torque_is_one_that_a_tilt
         needed = np.array([compensator.settings.exact.torque(theta.tolist(), tilt) for tilt in tilts])
         assert np.all(effort > needed.min(axis=0) - 0.3)
         assert np.all(effort < needed.max(axis=0) + 0.3)
+
+
+def is_untouched(carried, pressed=(0.0, 0.0, 0.0), lacking=(0.0, 0.0, 0.0)):
+    """Return what is seen of a robot whose motors carry more than itself, while something presses on its joints, Nm."""
+    watch, momentum = TouchWatch(), np.zeros(3)
+    for n in range(round(1.5 * TOUCH.time / 0.004)):
+        found = watch.step(0.004 * n, 0.5, momentum, np.array(carried), np.array(carried), np.array(lacking))
+        momentum = momentum + 0.004 * np.add(carried, pressed)
+    return found
+
+
+def test_a_robot_is_untouched_if_all_joints_are_free_two_carry_more_than_it_and_the_motors_apply_what_is_asked():
+    loaded, worn = (3.0, 2.0, 0.3), (-3.0, -2.0, -0.3)
+    answers = [is_untouched(loaded), is_untouched(loaded, worn), is_untouched(loaded, (0.0, 0.0, -0.5))]
+    answers += [is_untouched((3.0, 0.3, 0.3)), is_untouched(loaded, lacking=loaded)]
+    assert answers == [True, False, False, False, False]
 
 
 def test_where_the_velocity_is_not_known_a_change_takes_longer_and_settings_that_change_no_torque_begin_none():
