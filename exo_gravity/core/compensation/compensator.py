@@ -18,7 +18,7 @@ import numpy as np
 
 from exo_gravity.core.arm.interface import MAX_PAYLOAD, STANDARD_GRAVITY
 from exo_gravity.core.arm.tilt import AXES, Tilt
-from exo_gravity.core.compensation.guidance import DROP, PAUSE, DropWatch, GuidedChange, TouchWatch
+from exo_gravity.core.compensation.guidance import DROP, PAUSE, TOUCH, DropWatch, GuidedChange, TouchWatch
 from exo_gravity.core.compensation.settings import Settings
 from exo_gravity.core.compensation.support import SupportRequest
 from exo_gravity.core.compensation.terms.terms import Terms, TermsInForce
@@ -179,7 +179,8 @@ class Compensator:
             limited(new, last, step * (s.max_effort_rate + turn * most))
             for new, last, most in zip(torque, self._effort, s.max_effort, strict=True)
         ])  # fmt: skip
-        if velocity and self.applied and s.mode == "zero_g":
+        is_due = s.mode == "zero_g" and now - self._touch_watch.time >= TOUCH.period
+        if is_due and velocity and self.applied:
             self._withdraw_from_empty(at, velocity, self.applied)
         over = tuple([n for n, most in enumerate(s.max_effort) if not -most <= gravity[n] <= most])
         remainder = () if change.is_over else change.remainder

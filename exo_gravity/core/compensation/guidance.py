@@ -60,7 +60,8 @@ class DropWatch:
 class TouchLimits:
     """By what it shows that nothing touches the robot."""
 
-    bandwidth: float = 80.0  #: 1/s, of the momentum observer
+    bandwidth: float = 80.0  #: 1/s, of the momentum observer,
+    period: float = 0.0075  #: which needs a tenth of a millisecond, and looks no sooner again, s
     heavy: float = 0.8  #: Nm beyond the robot's weight, from which on a joint tells,
     joints: int = 2  #: and so many must: one alone is free where a wearer begins to lift the arm
     share: float = 0.3  #: of that,
@@ -78,10 +79,12 @@ class TouchWatch:
     A person's arm presses on the robot by what the motors carry of it, less what moves it. A momentum observer (De Luca
     et al., IROS 2006) tells from the motors' torque and the motion what presses on each joint. People who reach, wave
     or push free all joints at once for a moment at most; an empty robot is free for ever.
+
+    time: s, of the last look.
     """
 
     def __init__(self) -> None:
-        self._time = -math.inf
+        self.time = -math.inf
         self._is_applied = False  # whether the motors apply what is asked of them, but for the brake
         self._free_for = 0.0  # s
         # (n,): what touches the robot, and what else changes its momentum, in Nm; and the momentum without errors
@@ -103,14 +106,14 @@ class TouchWatch:
         carried: (n,) Nm, what is asked of the motors beyond the robot's weight.
         lacking: (n,) Nm, what is asked of them and not applied.
         """
-        dt, gain = now - self._time, TOUCH.bandwidth
+        dt, gain = now - self.time, TOUCH.bandwidth
         if dt <= PAUSE:
             self._passed = self._passed + dt * (self._known + self._touch)
             self._touch = gain * (momentum - self._passed)
         else:
             dt, self._touch, self._is_applied = 0.0, -carried, False
             self._passed = momentum - self._touch / gain
-        self._time, self._known = now, known
+        self.time, self._known = now, known
         allowed = TOUCH.share * np.abs(carried) + TOUCH.least
         is_loaded = np.sum(np.abs(carried) >= TOUCH.heavy) >= TOUCH.joints
         is_applied = bool(is_loaded and np.all(np.abs(lacking) <= allowed))
