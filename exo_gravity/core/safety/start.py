@@ -105,9 +105,8 @@ def missing_for_a_start(
         low, high = math.degrees(limits.position_min[n]), math.degrees(limits.position_max[n])
         back = f"to be moved by {at_least(turn)} degrees, within its limits {low:.0f} to {high:.0f}"
         return Reason(Wait.JOINT_LIMITS, f"{limits.joint_names[n]} {back}")
-    if any(
-        abs(joint.velocity) > START_GATE.at_rest for joint in joints
-    ):  # an arm that swings is not where it will hang
+    # An arm that swings is not where it will hang.
+    if any(abs(joint.velocity) > START_GATE.at_rest for joint in joints):
         return Reason(Wait.REST, "the arm to be at rest")
     if not zeros_are_trusted:
         zeros = zip(limits.joint_names, joints, limits.home, limits.home_tolerance, strict=True)
