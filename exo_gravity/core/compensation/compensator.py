@@ -259,8 +259,7 @@ class Compensator:
         momentum, coriolis = (s.robot_by_mass or s.robot).links.momentum(at.theta, velocity)
         known = np.add(applied, coriolis) - weight
         carried, lacking = np.subtract(self._effort, weight), np.subtract(self._effort, applied)
-        speed = max(map(abs, velocity))
-        if self._touch_watch.step(at.time, speed, np.array(momentum), known, carried, lacking):
+        if self._touch_watch.step(at.time, max(map(abs, velocity)), np.array(momentum), known, carried, lacking):
             self.lost = {"mode": "one_g", "payload.mass": 0.0}
             self._pending = replace(s, mode="one_g", payload=s.payload._replace(mass=0.0))
 

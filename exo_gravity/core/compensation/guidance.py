@@ -58,16 +58,16 @@ class DropWatch:
 
 @dataclass(frozen=True)
 class TouchLimits:
-    """By what it shows that nothing touches the robot."""
+    """When nothing counts as touching the robot."""
 
-    bandwidth: float = 80.0  #: 1/s, of the momentum observer,
-    period: float = 0.0075  #: which needs a tenth of a millisecond, and looks no sooner again, s
+    bandwidth: float = 80.0  #: rad/s, of the momentum observer
+    period: float = 0.0075  #: s from one look to the next, at least: a look takes 0.1 ms
     heavy: float = 0.8  #: Nm beyond the robot's weight, from which on a joint tells,
     joints: int = 2  #: and so many must: one alone is free where a wearer begins to lift the arm
     share: float = 0.3  #: of that,
-    least: float = 0.2  #: and Nm, that friction and errors of the model may look like
+    least: float = 0.2  #: and Nm, which friction and model errors may amount to
     time: float = 0.1  #: s for which no joint is touched; 0.05 is the longest of 500 reaches and other motions
-    slow: float = 1.0  #: rad/s, up to which motors that apply what is asked of them show it; faster ones are braked
+    slow: float = 1.0  #: rad/s, below which no brake acts, so that the motors should apply what is asked of them
 
 
 TOUCH = TouchLimits()

@@ -55,9 +55,8 @@ def recorded_parameters(text: str, node: str) -> Mapping[str, Any]:
     """Return the parameters of `node` by name, from the text that the recorder wrote. Raises DataError."""
     try:
         # In libyaml's loader some 25,000 brackets in brackets would end the process; PyYAML's own one raises.
-        given = yaml.load(text, ros_yaml.EventLoader if len(text) < 10_000 else yaml.SafeLoader)[node][
-            "ros__parameters"
-        ]
+        loader = ros_yaml.EventLoader if len(text) < 10_000 else yaml.SafeLoader
+        given = yaml.load(text, loader)[node]["ros__parameters"]
         if {*map(type, given.keys())} <= {str}:
             return MappingProxyType(given)
     except (yaml.YAMLError, AttributeError, LookupError, TypeError, ValueError, RecursionError):
