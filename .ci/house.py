@@ -19,7 +19,7 @@ from pathlib import Path
 ROOT = Path(__file__).parents[1]
 sys.path[:0] = [str(ROOT)]
 
-from exo_gravity.core.safety.drive import FaultCode  # noqa: E402
+from exo_gravity.core.safety.command import FaultCode  # noqa: E402
 from test.faults.processes import CASES  # noqa: E402
 from test.faults.virtual_cases import ROWS  # noqa: E402
 from test.support.document_commands import DOCUMENTS  # noqa: E402

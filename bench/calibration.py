@@ -31,7 +31,7 @@ from exo_gravity.core.motors.ak import USUAL_MOTORS
 from exo_gravity.core.motors.families import MOTORS
 from exo_gravity.core.motors.joint_motor import SCALE_TEMPERATURE, JointMotor, scale_at
 from exo_gravity.core.numbers import COVER
-from exo_gravity.core.safety.drive import State
+from exo_gravity.core.safety.command import State
 from exo_gravity.core.safety.limits import Limits
 from exo_gravity.lab.calibration.imu import mounting_turn
 from exo_gravity.lab.calibration.moment_model import GRID, MomentModel

@@ -19,7 +19,7 @@ import can
 
 import exo_gravity
 from exo_gravity.core.compensation.compensator import Compensator
-from exo_gravity.core.safety.drive import State
+from exo_gravity.core.safety.command import State
 from exo_gravity.core.safety.limits import Limits
 from exo_gravity.lab.inputs.arms import read_arm
 from exo_gravity.lab.inputs.parameter_file import load, packaged_config

@@ -19,10 +19,10 @@ from pathlib import Path
 from exo_gravity.core.arm.tilt import Tilt
 from exo_gravity.core.motors.joint_motor import REPLY_SHARE, UNKNOWN
 from exo_gravity.core.numbers import Torque
-from exo_gravity.core.safety.drive import Drive, Send
+from exo_gravity.core.safety.command import Command, Send
 from exo_gravity.core.safety.start import SwitchingOn
 from exo_gravity.hardware.can_port import ArmOnBus
-from exo_gravity.hardware.clock import COMPUTER_CLOCK, favour
+from exo_gravity.hardware.clock import COMPUTER_CLOCK, raise_priority
 from exo_gravity.hardware.motor_bus import MotorBus
 from exo_gravity.lab.inputs.arms import read_arm
 from exo_gravity.lab.inputs.parameter_file import can_options, load
@@ -66,8 +66,8 @@ class DirectArm:
         deadline = time.monotonic()
         while not stopping:
             is_known = UNKNOWN not in bus.samples
-            drive = Drive(tuple(efforts()) if is_known else nothing, nothing, tuple(send), is_known)
-            replies += bus.exchange(drive, time.monotonic() + REPLY_SHARE * period)
+            command = Command(tuple(efforts()) if is_known else nothing, nothing, tuple(send), is_known)
+            replies += bus.exchange(command, time.monotonic() + REPLY_SHARE * period)
             if replies == REPLIES and not switching.done:
                 send, replies = switching.step(), 0
             if UNKNOWN not in bus.samples:
@@ -89,9 +89,9 @@ def run_node(part: str, arm: DirectArm, namespace: str, period: float, stopping:
     from rclpy.signals import SignalHandlerOptions
     from sensor_msgs.msg import JointState
 
-    from exo_gravity.hardware.network import keep_to_this_machine
+    from exo_gravity.hardware.network import restrict_to_localhost
 
-    keep_to_this_machine()
+    restrict_to_localhost()
     rclpy.init(args=[], signal_handler_options=SignalHandlerOptions.NO)
     node, newest = rclpy.create_node(f"bare_{part}", namespace=namespace), [[0.0] * len(arm.motors)]
     executor = SingleThreadedExecutor()
@@ -133,7 +133,7 @@ def main() -> None:
     part, params, namespace, rate = sys.argv[1:]
     stopping: list[int] = []
     signal.signal(signal.SIGTERM, lambda *_: stopping.append(True))
-    favour(15 if part == "compensator" else 20)
+    raise_priority(15 if part == "compensator" else 20)
     arm, period = DirectArm(params, namespace), 1.0 / float(rate)
     if part != "python":
         run_node(part, arm, namespace, period, stopping)

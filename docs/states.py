@@ -13,7 +13,7 @@ from itertools import pairwise
 from pathlib import Path
 from typing import NamedTuple
 
-from exo_gravity.core.safety.drive import TRANSITIONS, State
+from exo_gravity.core.safety.command import TRANSITIONS, State
 
 Point = tuple[float, float]
 Arrow = tuple[State, State]

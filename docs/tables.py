@@ -23,7 +23,7 @@ from exo_gravity.core.errors import ParameterError
 from exo_gravity.core.motors.families import OURS
 from exo_gravity.core.motors.frames import MotorSpec, WireFormat
 from exo_gravity.core.params import Param
-from exo_gravity.core.safety.drive import FaultCode
+from exo_gravity.core.safety.command import FaultCode
 from exo_gravity.core.safety.limits import CAN_BRIDGE
 from exo_gravity.core.trunk.params import IMU
 from exo_gravity.lab.bag.content import RECORDER

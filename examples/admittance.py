@@ -35,7 +35,7 @@ from exo_gravity.core.compensation.terms.terms import TermSettings
 from exo_gravity.core.motors.families import MOTORS
 from exo_gravity.core.motors.joint_motor import JointMotor
 from exo_gravity.core.numbers import COVER, for_joints
-from exo_gravity.core.safety.drive import State
+from exo_gravity.core.safety.command import State
 from exo_gravity.core.safety.limits import Limits
 from exo_gravity.lab.inputs.arms import read_arm
 from exo_gravity.lab.inputs.parameter_file import load

@@ -19,7 +19,7 @@ from exo_gravity.core.compensation.terms.catalogue import Friction, Spring
 from exo_gravity.core.compensation.terms.terms import TermSettings
 from exo_gravity.core.motors.families import MOTORS
 from exo_gravity.core.motors.joint_motor import JointMotor
-from exo_gravity.core.safety.drive import State
+from exo_gravity.core.safety.command import State
 from exo_gravity.core.safety.limits import Limits
 from exo_gravity.sim import SimulatedArm, SimulatedDevice, SimulatedMotor, VirtualWearer
 from exo_gravity.sim.controllers import DirectController

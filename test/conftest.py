@@ -16,7 +16,7 @@ from pathlib import Path
 
 import pytest
 
-from exo_gravity.hardware.clock import favour
+from exo_gravity.hardware.clock import raise_priority
 
 from .support.ports import own_domain
 from .support.selection import UNDER_COLCON, missing_packages
@@ -34,7 +34,7 @@ def machine() -> Iterator[Machine]:
     """The machine for one test of running nodes at a time, which tells what it kept from them."""
     if int(os.environ.get("PYTEST_XDIST_WORKER_COUNT", "1")) > 1:
         pytest.fail("tests marked real_time run alone: use `-m real_time` without -n")
-    favour(5)  # what a test receives is in time
+    raise_priority(5)  # what a test receives is in time
     machine = Machine()
     yield machine
     machine.close()

@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 from exo_gravity.core import vocabulary
-from exo_gravity.core.safety.drive import FaultCode, State
+from exo_gravity.core.safety.command import FaultCode, State
 from exo_gravity.core.safety.start import TRANSIENT_FAULTS
 from exo_gravity.core.vocabulary import NONE, Reason, Word
 from exo_gravity.lab import vocabulary as of_lab

@@ -18,7 +18,7 @@ from exo_gravity.core.arm.tilt import Tilt
 from exo_gravity.core.errors import ParameterError
 from exo_gravity.core.motors.ak import MIT_V3
 from exo_gravity.core.motors.joint_motor import JointMotor
-from exo_gravity.core.safety.drive import State
+from exo_gravity.core.safety.command import State
 from exo_gravity.hardware.trunk_estimator import ImuSample, TrunkEstimator
 from exo_gravity.sim import SimulatedDevice, SimulatedImu, SimulatedMotor
 from exo_gravity.sim.motors import simulated
@@ -165,7 +165,7 @@ class OrdinaryArm(Rig):
         """Start the arm again and again for `duration` s, and let it down after it was carried for `carried` s."""
         while self.now < self._begin + duration:
             self._start(carried)
-        self.result.time, self.result.rides = self.now - self._begin, self.safety.ride.rides
+        self.result.time, self.result.rides = self.now - self._begin, self.safety.stale.count
         self.loop.bus.close()
         return self.result
 

@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 from functools import partial
 
 from exo_gravity.core.arm.interface import Payload
-from exo_gravity.core.safety.drive import State
+from exo_gravity.core.safety.command import State
 from exo_gravity.sim import SimulatedDevice
 from exo_gravity.sim.events import ACTS as SHARED
 from exo_gravity.sim.events import imu_wrong, payload_dropped

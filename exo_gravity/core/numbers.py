@@ -17,7 +17,7 @@ NO_TORQUE: Torque = (0.0,) * JOINT_COUNT
 COVER = 1.96  # standard deviations of a 95 % band
 
 
-def limited(wanted: float, last: float, step: float) -> float:
+def rate_limited(wanted: float, last: float, step: float) -> float:
     """Return `wanted` within `step` of `last`."""
     return max(last - step, min(last + step, wanted))
 

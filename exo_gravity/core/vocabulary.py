@@ -1,7 +1,7 @@
 # Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
 """The words that programs read on /diagnostics, beside the sentences for people: docs/keys.md.
 
-Each word stands once: the states and the fault codes of an arm in core/safety/drive.py, those of nodes off the path
+Each word stands once: the states and the fault codes of an arm in core/safety/command.py, those of nodes off the path
 in lab/vocabulary.py, all others here. A `Reason` is a sentence together with its word, so that what decides on a torque
 tells both at once.
 """

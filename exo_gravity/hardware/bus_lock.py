@@ -25,7 +25,7 @@ from pathlib import Path
 from exo_gravity.core.errors import BusError
 from exo_gravity.core.motors.joint_motor import Address
 from exo_gravity.core.numbers import MAX_JOINTS
-from exo_gravity.core.safety.drive import Drive, Send
+from exo_gravity.core.safety.command import Command, Send
 from exo_gravity.core.safety.limits import DAMPING, MAX_EFFORT
 from exo_gravity.hardware.clock import COMPUTER_CLOCK, Clock
 
@@ -37,16 +37,16 @@ NAME = "\0exo_gravity/"  # the first character makes a socket's name abstract
 FOLDERS = ("/run/lock", "/dev/shm", "/tmp")
 FLAGS = os.O_NOFOLLOW | os.O_NONBLOCK  # another user may have put a link or a pipe there
 SHARED = stat.S_ISVTX | stat.S_IWOTH | stat.S_IXOTH
-# By the number of joints: the first fields of `DriveNotes`, written at once.
+# By the number of joints: the first fields of `CommandNotes`, written at once.
 NOTES = [struct.Struct(f"={3 + 2 * count}d") for count in range(MAX_JOINTS + 1)]
 CREDENTIALS = struct.Struct("=3i")  # PID, user and group of the process that listens on a socket; unix(7)
-UNKNOWN_DRIVE = Drive((), (), (), True)  # of motors that may be on
+UNKNOWN_COMMAND = Command((), (), (), True)  # of motors that may be on
 
 
-class DriveNotes(ctypes.Structure):
+class CommandNotes(ctypes.Structure):
     """One page of shared memory: what the motors of a bus receive, who owns the bus, and the watchdog's heartbeat.
 
-    `MotorBus` notes each drive before its frames are sent. A process that outlives the writer thus knows the torque
+    `MotorBus` notes each command before its frames are sent. A process that outlives the writer thus knows the torque
     that the motors still apply. An empty page means that the motors are off. Create it by `from_buffer`.
     """
 
@@ -60,25 +60,25 @@ class DriveNotes(ctypes.Structure):
     )
     clock: Clock = COMPUTER_CLOCK
 
-    def note(self, drive: Drive) -> None:
+    def note(self, command: Command) -> None:
         """Note what the motors are about to receive, and whether one may be on."""
-        count = len(drive.effort)
-        NOTES[count].pack_into(self, 0, self.clock.monotonic(), drive.powered, count, *drive.effort, *drive.damping)
+        count, values = len(command.effort), (*command.effort, *command.damping)
+        NOTES[count].pack_into(self, 0, self.clock.monotonic(), command.powered, count, *values)
 
     @property
-    def drive(self) -> Drive:
+    def command(self) -> Command:
         """What the motors received last; of as many motors as were noted, of none before the first note."""
         powered = bool(self._powered)
         count = int(self._count) if self._count in range(MAX_JOINTS + 1) else 0
         values = self._values[: 2 * count]
         send = Send.COMMAND if powered else Send.POLL
-        return Drive(tuple(values[:count]), tuple(values[count:]), (send,) * count, powered)
+        return Command(tuple(values[:count]), tuple(values[count:]), (send,) * count, powered)
 
     @property
     def is_damaged(self) -> bool:
-        """Whether these are no notes: numbers that no drive has."""
-        drive = self.drive
-        return self._count != len(drive.effort) or not all(abs(x) <= MAX_EFFORT for x in drive.effort + drive.damping)
+        """Whether these are no notes: numbers that no command has."""
+        effort, damping, *_ = self.command
+        return self._count != len(effort) or not all(abs(value) <= MAX_EFFORT for value in effort + damping)
 
     @property
     def owner(self) -> str:
@@ -116,18 +116,18 @@ class BusLock:
             self.problem = f"{path}: {error.strerror}"
             self.descriptor = os.memfd_create("exo_gravity")
             os.ftruncate(self.descriptor, mmap.PAGESIZE)
-        self.notes = DriveNotes.from_buffer(mmap.mmap(self.descriptor, mmap.PAGESIZE))  #: the shared page
+        self.notes = CommandNotes.from_buffer(mmap.mmap(self.descriptor, mmap.PAGESIZE))  #: the shared page
         self.notes.clock = clock
         if self.notes.is_damaged:
             self.problem = f"{path}: damaged"
         if self.problem:
-            self.notes.note(UNKNOWN_DRIVE)
+            self.notes.note(UNKNOWN_COMMAND)
         self.notes.owner = owner
         self.notes.heartbeat = 0.0
 
     def release(self) -> None:
         """Give up the bus: it is free once the watchdog has ended, too."""
-        if not self.notes.drive.powered:
+        if not self.notes.command.powered:
             remove_notes(self.descriptor)
         os.close(self.descriptor)
         self.socket.close()
@@ -141,7 +141,7 @@ class ArmNotes:
     clock: of the times of the notes.
     """
 
-    def __init__(self, pages: Sequence[DriveNotes], joints: Sequence[int] | None = None) -> None:
+    def __init__(self, pages: Sequence[CommandNotes], joints: Sequence[int] | None = None) -> None:
         self.clock = pages[0].clock
         self._pages = pages
         noted = pages if joints is None else [pages[joint] for joint in joints]
@@ -151,24 +151,24 @@ class ArmNotes:
         """Return the notes of the buses of these joints alone."""
         return ArmNotes(self._pages, joints)
 
-    def note(self, drive: Drive) -> None:
+    def note(self, command: Command) -> None:
         """Note what the motors are about to receive."""
         for page in self.noted:
-            page.note(drive)
+            page.note(command)
 
     @property
-    def drive(self) -> Drive:
+    def command(self) -> Command:
         """What the motors received last; powered if they may be on on one bus.
 
         Without torque, under full damping, where that is not known: the notes may be those of another arm.
         """
-        drives, count = [page.drive for page in self._pages], len(self._pages)
+        commands, count = [page.command for page in self._pages], len(self._pages)
         columns = [
-            (drive.effort[i], drive.damping[i]) if len(drive.effort) == count else (0.0, DAMPING)
-            for i, drive in enumerate(drives)
+            (command.effort[i], command.damping[i]) if len(command.effort) == count else (0.0, DAMPING)
+            for i, command in enumerate(commands)
         ]
         effort, damping = zip(*columns, strict=True)
-        return Drive(effort, damping, (Send.COMMAND,) * count, any(drive.powered for drive in drives))
+        return Command(effort, damping, (Send.COMMAND,) * count, any(command.powered for command in commands))
 
     @property
     def time(self) -> float:
@@ -287,6 +287,6 @@ def _holder(address: Address) -> str:
     with contextlib.suppress(OSError, ValueError):
         descriptor = os.open(notes_file(address), os.O_RDONLY | FLAGS)
         with os.fdopen(descriptor, "rb"):
-            if owner := DriveNotes.from_buffer_copy(os.pread(descriptor, mmap.PAGESIZE, 0)).owner:
+            if owner := CommandNotes.from_buffer_copy(os.pread(descriptor, mmap.PAGESIZE, 0)).owner:
                 return owner
     return f"a process that left no notes here, as of another container: `ss -xlp | grep {bus_name(address)}` shows it"

@@ -56,7 +56,7 @@ class ComputerClock:
 COMPUTER_CLOCK = ComputerClock()
 
 
-def favour(priority: int) -> None:
+def raise_priority(priority: int) -> None:
     """Request nice value -`priority` (1..20) and precise sleeps: by default Linux ends them up to 50 us late.
 
     This applies to the calling thread and those that it starts later. Where Linux groups processes by session

@@ -7,7 +7,7 @@ two cycles. The loop is paced by absolute deadlines on the clock of its bus, so 
 
 An exception anywhere lets the arm down: a controller without efforts has withdrawn them, an exception of the bus is a
 silent bus, one in the state machine a fault. If the state machine keeps failing, the watchdog takes over from the
-last noted drive; without a watchdog, the loop lowers the arm without the state machine (`lower`).
+last noted command; without a watchdog, the loop lowers the arm without the state machine (`lower`).
 """
 
 import contextlib
@@ -21,7 +21,7 @@ from typing import Any, Protocol
 
 from exo_gravity.core.errors import BusError
 from exo_gravity.core.motors.joint_motor import REPLY_SHARE, JointSample
-from exo_gravity.core.safety.drive import CARRYING, NO_EFFORTS, Drive, Efforts, FaultCode, Send, State
+from exo_gravity.core.safety.command import CARRYING, NO_EFFORTS, Command, Efforts, FaultCode, Send, State
 from exo_gravity.core.safety.limits import DAMPING
 from exo_gravity.core.safety.machine import SafetyMachine
 from exo_gravity.core.safety.watch import RestTracker
@@ -110,7 +110,7 @@ class ControlLoop:
         #: The exception that ended the control, if any.
         self.failure: BaseException | None = None
         #: What a start waits for besides the boards of the motors, set from outside; '' for nothing.
-        self.hindrance = NO_REASON
+        self.setup_error = NO_REASON
         #: s, of the owner's last sign of life; inf if it gives none. One that stands still could not let the arm down.
         self.attended = math.inf
         #: Its counts may be read, and it may be used within a `call`.
@@ -123,7 +123,7 @@ class ControlLoop:
             safety.probe(self._now())
         self._due = self._now()  # of the next cycle
         self._errors = 0  # in a row
-        self._drive = Drive.off(len(bus.samples))  # last decided
+        self._command = Command.off(len(bus.samples))  # last decided
         self._foreign_commands = 0  # so far
         self._suspended = bus.clock.suspended()  # s, so far
         self._work = period  # s per cycle, without waiting for efforts; smoothed
@@ -153,11 +153,11 @@ class ControlLoop:
                 return True
         except BaseException as error:  # whatever happened, the arm must come down
             self.failure = error
-            if self._drive.powered:  # the watchdog ends this process; without one, the arm is lowered here
+            if self._command.powered:  # the watchdog ends this process; without one, the arm is lowered here
                 with contextlib.suppress(Exception):
                     if self._hand_over(f"the control loop failed: {type(error).__name__}: {error}"):
                         self._clock.sleep(HAND_OVER_TIME)
-                lower(self.bus, self._drive, self.period)
+                lower(self.bus, self._command, self.period)
         self.bus.stop()
         self._has_ended = True
         return False
@@ -231,11 +231,11 @@ class ControlLoop:
         if self._is_stopping:
             self.safety.disable(now)
         if self.safety.state is State.CHECKING:
-            boards = self.bus.boards.hindrance(now, 1.0 / self.period)
-            self.safety.hindrance = self.hindrance or (Reason(Wait.BOARD_SETUP, boards) if boards else NO_REASON)
-        drive = self._drive = self.safety.step(now, tuple(self.bus.samples), efforts)
+            boards = self.bus.boards.setup_error(now, 1.0 / self.period)
+            self.safety.setup_error = self.setup_error or (Reason(Wait.BOARD_SETUP, boards) if boards else NO_REASON)
+        command = self._command = self.safety.step(now, tuple(self.bus.samples), efforts)
         try:
-            complete = self.bus.exchange(drive, now + REPLY_SHARE * self.period)
+            complete = self.bus.exchange(command, now + REPLY_SHARE * self.period)
         except BusError as error:
             self.safety.trip(FaultCode.BUS_ERROR, str(error), now)
             complete = False
@@ -271,8 +271,8 @@ class ControlLoop:
         return deadline
 
 
-def lower(bus: MotorBus, drive: Drive, period: float) -> None:
-    """Lower an arm whose motors receive `drive`, without the state machine; return once each has replied to EXIT.
+def lower(bus: MotorBus, command: Command, period: float) -> None:
+    """Lower an arm whose motors receive `command`, without the state machine; return once each has replied to EXIT.
 
     The torque fades slowly under full damping, also of a motor that does not reply: it may obey. The damping stays
     until the joints have been at rest for a while: a joint under damping creeps, and would fall if it were switched off
@@ -280,7 +280,7 @@ def lower(bus: MotorBus, drive: Drive, period: float) -> None:
     """
     clock, start, exits = bus.clock, bus.clock.monotonic(), 0
     rest = RestTracker(len(bus.samples))
-    confirmed = [False] * len(drive.effort)
+    confirmed = [False] * len(command.effort)
     while not all(confirmed):
         now, joints = clock.monotonic(), tuple(bus.samples)
         silent = [now - joint.time > LOWERING.reply_timeout for joint in joints]
@@ -294,12 +294,12 @@ def lower(bus: MotorBus, drive: Drive, period: float) -> None:
             send = tuple(
                 [Send.COMMAND if bus.replies[i] or not silent[i] else Send.NOTHING for i in range(len(joints))]
             )
-        effort = tuple([left * torque for torque in drive.effort])
+        effort = tuple([left * torque for torque in command.effort])
         with contextlib.suppress(Exception):
-            bus.exchange(Drive(effort, (DAMPING,) * len(effort), send, True), now + period)
+            bus.exchange(Command(effort, (DAMPING,) * len(effort), send, True), now + period)
         if exits > 1:  # a reply after the second EXIT is none to the command before the first
             samples = zip(confirmed, bus.samples, strict=True)
             confirmed = [was or sample.time >= now for was, sample in samples]
         clock.sleep(max(0.0, now + period - clock.monotonic()))
     with contextlib.suppress(Exception):
-        bus.exchange(Drive.off(len(effort)), clock.monotonic() + period)
+        bus.exchange(Command.off(len(effort)), clock.monotonic() + period)

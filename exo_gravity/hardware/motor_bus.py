@@ -42,8 +42,8 @@ from exo_gravity.core.motors.frames import (
     WireFormat,
 )
 from exo_gravity.core.motors.joint_motor import UNKNOWN, JointMotor, JointSample
-from exo_gravity.core.numbers import limited
-from exo_gravity.core.safety.drive import Drive, Send
+from exo_gravity.core.numbers import rate_limited
+from exo_gravity.core.safety.command import Command, Send
 from exo_gravity.core.safety.limits import DAMPING
 from exo_gravity.hardware.can_port import CanPort, awaited
 from exo_gravity.hardware.clock import COMPUTER_CLOCK, Clock
@@ -68,7 +68,7 @@ class MotorBus:
 
     ports: of the bus of each motor (n,), None if it is not open: such a joint counts as at rest, without torque, and is
         sent nothing.
-    note: called with each drive before its frames are sent.
+    note: called with each command before its frames are sent.
     clock: of all times.
 
     Raises ParameterError if there are not as many ports as motors, as with a python-can bus in their place.
@@ -78,7 +78,7 @@ class MotorBus:
         self,
         ports: Sequence[CanPort | None],
         motors: Sequence[JointMotor],
-        note: Callable[[Drive], None] = lambda drive: None,
+        note: Callable[[Command], None] = lambda command: None,
         clock: Clock = COMPUTER_CLOCK,
     ) -> None:
         count = len(motors)
@@ -105,11 +105,11 @@ class MotorBus:
         self._asked = frozenset(joint for joint in self._joints if self.replies[joint])
         self._joint_of = {motor.can_id: joint for joint, motor in enumerate(motors)}
         self._aliased: set[int] = set()  # IDs of motors whose board obeys other IDs, too
-        #: Whether the last drive did not leave for each motor (n,), because its bus failed.
+        #: Whether the last command did not leave for each motor (n,), because its bus failed.
         self.unsent: Sequence[bool] = (False,) * len(motors)
         #: Whether each motor (n,) was sent nothing in the last cycle, to learn how old its replies are.
         self.held_back: Sequence[bool] = (False,) * len(motors)
-        self._drive = Drive.off(count)  # last sent
+        self._command = Command.off(count)  # last sent
         self._has_sent = False  # anything: another owner's motors are left alone
         self._corrected = [-math.inf] * count  # s
         self._contested = [-math.inf] * count  # s of the last foreign command to the motor
@@ -147,20 +147,20 @@ class MotorBus:
             names = " or ".join(port.name for port in self._buses)
             raise BusError(f"CAN bus {names} is in use: {heard}; stop the other commander first")
 
-    def exchange(self, drive: Drive, deadline: float) -> bool:
-        """Send every motor its part of `drive`, then collect replies until all arrived or `deadline` (s).
+    def exchange(self, command: Command, deadline: float) -> bool:
+        """Send every motor its part of `command`, then collect replies until all arrived or `deadline` (s).
 
         Returns whether all motors replied in time. Raises BusError if a bus fails, once the others have had their part.
         """
         self._failed.clear()
-        self._note(drive)
+        self._note(command)
         for port in self._buses:  # replies that arrived after their cycle are not replies to this one
             try:
                 for message in port.waiting():
                     self._take(port, message)
             except BusError as error:
                 self._failed[port] = error
-        self._drive, self._has_sent = drive, True
+        self._command, self._has_sent = command, True
         now = self._now()
         frames: dict[CanPort | None, list[Frame]] = {port: [] for port in self._ports}
         held_back = [False] * len(self._ports)
@@ -168,12 +168,12 @@ class MotorBus:
             due = self._frames(joint, now)
             if due and self.replies[joint]:
                 is_paused = not self._requests[joint].may_send(now, deadline - now)
-                held_back[joint] = is_paused and drive.send[joint] in (Send.COMMAND, Send.POLL)
+                held_back[joint] = is_paused and command.send[joint] in (Send.COMMAND, Send.POLL)
                 if held_back[joint]:
                     continue
                 self._requests[joint].sent(now, len(due))
             frames[own] += due
-            if drive.send[joint] is Send.POLL:
+            if command.send[joint] is Send.POLL:
                 frames[own] += self.boards.question(joint, now)
         for own, all_due in frames.items():
             self._send(own, *all_due, may_be_lost=True)
@@ -211,7 +211,7 @@ class MotorBus:
         Nothing is sent to others: another owner may have left them on.
         """
         off = (Send.POLL, Send.EXIT, Send.CLEAR_ERROR)
-        left = [joint for joint, send in enumerate(self._drive.send) if self._has_sent and send in off]
+        left = [joint for joint, send in enumerate(self._command.send) if self._has_sent and send in off]
         for _ in range(2 if left else 0):
             self._failed.clear()
             self._answered.clear()
@@ -239,10 +239,10 @@ class MotorBus:
             raise error
 
     def _frames(self, joint: int, now: float) -> tuple[Frame, ...]:
-        """Return what a motor is sent in the present drive."""
-        send, motor = self._drive.send[joint], self._motors[joint]
+        """Return what a motor is sent of the present command."""
+        send, motor = self._command.send[joint], self._motors[joint]
         if send is Send.COMMAND:
-            return (self._command(joint, now),)
+            return (self._command_frame(joint, now),)
         if send is Send.POLL:
             return (motor.idle,) if self.replies[joint] else ()
         if send is Send.EXIT:
@@ -307,7 +307,7 @@ class MotorBus:
         """Let the temperature that a motor's commands count with follow its reading, without a step."""
         last, most = self._warmth[joint], WARMING * max(0.0, sample.time - self.samples[joint].time)
         reading = float(sample.temperature or 0.0)
-        self._warmth[joint] = reading if last is None else limited(reading, last, most)
+        self._warmth[joint] = reading if last is None else rate_limited(reading, last, most)
 
     def _follow(self, joint: int, sample: JointSample) -> None:
         """Let the held position of a contested joint follow it slowly, or at once if its motor does not hold it."""
@@ -321,11 +321,11 @@ class MotorBus:
 
     def _hold(self, joint: int, now: float) -> float:
         """Return the share of its stiffness by which a contested motor holds its joint; it fades, without a step."""
-        return max(0.0, 1.0 - (now - self._contested[joint]) / CONTEST_TIME) if self._drive.powered else 0.0
+        return max(0.0, 1.0 - (now - self._contested[joint]) / CONTEST_TIME) if self._command.powered else 0.0
 
-    def _command(self, joint: int, now: float) -> Frame:
-        """Return the last drive's command to a motor. If the motor is contested, it also holds the joint."""
-        motor, effort, damping = self._motors[joint], self._drive.effort[joint], self._drive.damping[joint]
+    def _command_frame(self, joint: int, now: float) -> Frame:
+        """Return the frame of the last command to a motor. If the motor is contested, it also holds the joint."""
+        motor, effort, damping = self._motors[joint], self._command.effort[joint], self._command.damping[joint]
         if now - self._contested[joint] < CONTEST_TIME and (hold := self._hold(joint, now)):
             damping = max(DAMPING, damping)
             if not math.isnan(self._held[joint]):
@@ -341,11 +341,11 @@ class MotorBus:
         self.foreign_commands += 1
         self._contested[joint] = now
         self.foreign_command = f"another sender commands motor {motor.can_id} (frame [{foreign.hex(' ')}])"
-        if self._drive.send[joint] not in (Send.COMMAND, Send.ENTER):
+        if self._command.send[joint] not in (Send.COMMAND, Send.ENTER):
             return
         if foreign in [data for _, data in motor.set_zero]:
             self._held[joint] = math.nan  # not held in this contest: a reply may still count from the old zero
-        command = self._command(joint, now)
+        command = self._command_frame(joint, now)
         is_exit = foreign in motor.wire_format.stops
         if is_exit or now - self._corrected[joint] >= CORRECTION_PERIOD:
             self._send(self._ports[joint], *(motor.enter if is_exit else ()), command)

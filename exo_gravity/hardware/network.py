@@ -31,7 +31,7 @@ def check_environment() -> None:
         raise ParameterError("ROS's folder of logs", str(log), expected) from None
 
 
-def keep_to_this_machine() -> None:
+def restrict_to_localhost() -> None:
     """Set which hosts this process communicates with; call it before `rclpy.init`.
 
     This machine alone, unless EXO_GRAVITY_DISCOVERY_RANGE widens it. ROS's setup.bash exports
@@ -47,7 +47,7 @@ def keep_to_this_machine() -> None:
         os.environ[PROFILES] = str(Path(__file__).with_name("fastdds_peers.xml"))
 
 
-def kept_to_this_machine() -> str:
+def localhost_notice() -> str:
     """Return, for the log, that other computers see no node, and what admits them; '' if they may."""
     if os.environ.get(ROS_RANGE) != "LOCALHOST" or os.environ.get("ROS_STATIC_PEERS"):
         return ""

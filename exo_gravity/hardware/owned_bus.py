@@ -17,7 +17,7 @@ from dataclasses import dataclass, replace
 from multiprocessing import Pipe
 
 from exo_gravity.core.errors import BusError
-from exo_gravity.core.safety.drive import Send
+from exo_gravity.core.safety.command import Send
 from exo_gravity.core.safety.machine import SafetyMachine
 from exo_gravity.core.safety.watch import excess_torque, expected_torque
 from exo_gravity.hardware.bus_lock import ATTEMPT_TIME, ArmNotes, BusLock, bus_name
@@ -65,10 +65,10 @@ def let_down(arm: ArmOnBus, notes: ArmNotes, log: Callable[[str], None], is_want
             notes.clock.sleep(REACH_PERIOD)
     left = [joint for joint in arm.joints if not ports[joint]]
     own = notes.of([joint for joint in arm.joints if ports[joint]])
-    drive, clock, is_complete = notes.drive, notes.clock, False
+    command, clock, is_complete = notes.command, notes.clock, False
     motors = MotorBus(ports, arm.motors, note=own.note, clock=clock)
     send = [Send.COMMAND if replies else Send.NOTHING for replies in motors.replies]
-    first = drive._replace(send=tuple(send), powered=True)
+    first = command._replace(send=tuple(send), powered=True)
     end = clock.monotonic() + REACH_PERIOD
     while not is_complete and clock.monotonic() < end:
         try:
@@ -76,7 +76,7 @@ def let_down(arm: ArmOnBus, notes: ArmNotes, log: Callable[[str], None], is_want
         except BusError:
             clock.sleep(arm.period)
     # A motor that replies another torque than it received has been switched off or obeyed another sender.
-    effort, damping = list(drive.effort), list(drive.damping)
+    effort, damping = list(command.effort), list(command.damping)
     for i, joint in enumerate(motors.samples):
         expected = expected_torque(effort[i], damping[i], joint.velocity)
         if excess_torque(joint.effort, expected) > 0.0:  # not without a reply: that is NaN
@@ -197,7 +197,7 @@ class Watchdog:
     def close(self) -> None:
         """End the watchdog and wait until it has ended. If the motors may be on, it stays and lets the arm down."""
         self._sender.close()
-        if self._notes.drive.powered:
+        if self._notes.command.powered:
             return
         try:
             self.process.wait(HEARTBEAT.end)
@@ -251,12 +251,12 @@ def take_over(
     """
     lock = ArmLock(arm, owner, patience, clock)
     try:
-        drive = lock.notes.drive
+        command = lock.notes.command
         if problem := "; ".join(own.problem for own in lock.locks if own.problem):
             log(f"it is not known what the motors apply, they may be on ({problem}): letting the arm down")
-        elif drive.powered:
+        elif command.powered:
             log("the last can_bridge on this bus and its watchdog ended with the motors on: letting the arm down")
-        if drive.powered:
+        if command.powered:
             if not let_down(arm, lock.notes, log, lambda: True):
                 Watchdog(lock, arm).close()
                 raise BusError(f"CAN bus {arm.address[1]}: a motor that may be powered does not reply")

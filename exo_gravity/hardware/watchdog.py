@@ -2,10 +2,10 @@
 """The watchdog: a process that lets the arm down when its bridge dies, freezes or hands it over.
 
 It shares the notes of each bus with the bridge, and a pipe, which breaks when the bridge dies for any reason. It
-inherits the lock of each bus. If the motors were on, it continues from the last noted drive. A bridge that is alive but
-has noted nothing for `frozen_timeout` is killed first: two processes must never command one motor. Once a motor has not
-replied for seconds and all others are down, the next bridge may ask for the bus: then the watchdog ends, and its notes
-stay.
+inherits the lock of each bus. If the motors were on, it continues from the last noted command. A bridge that is alive
+but has noted nothing for `frozen_timeout` is killed first: two processes must never command one motor. Once a motor has
+not replied for seconds and all others are down, the next bridge may ask for the bus: then the watchdog ends, and its
+notes stay.
 
 While the motors are on it keeps the computer from being suspended: that would freeze both processes.
 
@@ -29,9 +29,9 @@ from queue import SimpleQueue
 import can
 
 from exo_gravity.core.safety.limits import Limits
-from exo_gravity.hardware.bus_lock import ArmNotes, DriveNotes, is_asked_for, remove_notes
+from exo_gravity.hardware.bus_lock import ArmNotes, CommandNotes, is_asked_for, remove_notes
 from exo_gravity.hardware.can_port import ArmOnBus
-from exo_gravity.hardware.clock import favour
+from exo_gravity.hardware.clock import raise_priority
 from exo_gravity.hardware.owned_bus import Silence, let_down
 
 POLL = 0.01  # s
@@ -70,7 +70,7 @@ def guard(
                 arm, patience = message, message.limits.frozen_timeout
                 with contextlib.suppress(KeyError, ImportError):  # imports the bus's module ahead of time
                     importlib.import_module(can.interfaces.BACKENDS[message.address[0]][0])
-            is_powered, noted, now = notes.drive.powered, notes.time, clock.monotonic()
+            is_powered, noted, now = notes.command.powered, notes.time, clock.monotonic()
             if arm:
                 for page in notes.noted:
                     page.heartbeat = now
@@ -79,7 +79,7 @@ def guard(
                 kill()  # it sends nothing from here on, even if it takes long to die
                 why = f"was frozen for {patience * 1000:.0f} ms and has been killed"
                 break
-    if not notes.drive.powered:
+    if not notes.command.powered:
         return 0
     if arm is None:
         log(f"can_bridge {why}: its motors may still be powered")
@@ -129,9 +129,9 @@ def main() -> None:
     """
     for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
         signal.signal(number, signal.SIG_IGN)
-    favour(20)
+    raise_priority(20)
     bridge, count, receiver, *shared = map(int, sys.argv[1:])
-    pages = {page: DriveNotes.from_buffer(mmap.mmap(page, mmap.PAGESIZE)) for page in shared[:count]}
+    pages = {page: CommandNotes.from_buffer(mmap.mmap(page, mmap.PAGESIZE)) for page in shared[:count]}
     locks = [socket.socket(fileno=lock) for lock in shared[count:]]
     log: SimpleQueue[str] = SimpleQueue()
     writer = threading.Thread(target=write_log, args=(log,), daemon=True)

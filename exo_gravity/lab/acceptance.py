@@ -24,8 +24,8 @@ import numpy as np
 from exo_gravity.core.arm.tilt import SIDES, Tilt
 from exo_gravity.core.motors.boards import CHECK
 from exo_gravity.core.motors.joint_motor import JointMotor, JointSample, source_of_bus
-from exo_gravity.core.numbers import limited
-from exo_gravity.core.safety.drive import Efforts, State
+from exo_gravity.core.numbers import rate_limited
+from exo_gravity.core.safety.command import Efforts, State
 from exo_gravity.core.safety.limits import Limits
 from exo_gravity.core.safety.machine import SafetyMachine
 from exo_gravity.core.vocabulary import Source
@@ -96,7 +96,7 @@ class Lift(SampleController):
         self._step = ACCEPTANCE.rise * period
 
     def _efforts_for(self, now: float, samples: Sequence[JointSample]) -> Efforts:
-        self.asked = limited(self.goal, self.asked, self._step)
+        self.asked = rate_limited(self.goal, self.asked, self._step)
         effort = (*(0.0 for _ in samples[:-1]), self.asked)
         return Efforts(effort, min(sample.time for sample in samples), damped=True, held=False)
 

@@ -24,8 +24,8 @@ from exo_gravity.core.errors import named
 from exo_gravity.core.motors.joint_motor import REPLY_SHARE, SIMULATED_BUSES, Traffic, motors_of, traffic_of
 from exo_gravity.core.safety.limits import CAN_BRIDGE, limits_of
 from exo_gravity.hardware.can_port import ArmOnBus, serials_of
-from exo_gravity.hardware.clock import favour, request_real_time
-from exo_gravity.hardware.network import MIDDLEWARE, check_environment, keep_to_this_machine, open_to_others
+from exo_gravity.hardware.clock import raise_priority, request_real_time
+from exo_gravity.hardware.network import MIDDLEWARE, check_environment, open_to_others, restrict_to_localhost
 from exo_gravity.lab.adapters import of_opening
 from exo_gravity.lab.findings import Finding, Level, judged
 from exo_gravity.lab.inputs.arms import node_values
@@ -87,7 +87,7 @@ def measure(period: float, seconds: float, priority: int) -> Wakeups:
     """
     lateness = np.zeros(max(1, round(seconds / period)))
     refused: list[str] = []
-    favour(20)
+    raise_priority(20)
 
     def run() -> None:
         deadline = time.monotonic()
@@ -290,7 +290,7 @@ def examine(nodes: Nodes, seconds: float, root: Path) -> list[Finding]:
     timeout = min(s[name] for s in settings for name in ("command_timeout", "frozen_timeout"))
     wakeups = measured(period, seconds, priority)
     late = of_wakeups(wakeups, period, timeout)
-    keep_to_this_machine()
+    restrict_to_localhost()
     middleware, reach = os.environ.get("RMW_IMPLEMENTATION"), os.environ["ROS_AUTOMATIC_DISCOVERY_RANGE"]
     return [
         late,

@@ -27,7 +27,7 @@ from exo_gravity.core.compensation.settings import robot_of
 from exo_gravity.core.errors import ParameterError
 from exo_gravity.core.numbers import JOINT_COUNT, Vector
 from exo_gravity.core.params import Param
-from exo_gravity.core.safety.drive import CARRYING, State
+from exo_gravity.core.safety.command import CARRYING, State
 from exo_gravity.core.safety.limits import WALL, Limits, limits_of
 from exo_gravity.hardware.urdf_arm import arm_in_file
 

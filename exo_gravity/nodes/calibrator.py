@@ -21,7 +21,7 @@ from sensor_msgs.msg import JointState
 
 from exo_gravity.core.errors import ParameterError
 from exo_gravity.core.numbers import Torque
-from exo_gravity.core.safety.drive import State
+from exo_gravity.core.safety.command import State
 from exo_gravity.core.trunk.inputs import TiltInput
 from exo_gravity.core.vocabulary import UNKNOWN
 from exo_gravity.lab.calibration.tour import calibrator_table, line_of, side_of, tour_of

@@ -13,7 +13,7 @@ import rclpy
 from rclpy.signals import SignalHandlerOptions
 from std_srvs.srv import Trigger
 
-from exo_gravity.hardware.network import keep_to_this_machine
+from exo_gravity.hardware.network import restrict_to_localhost
 from exo_gravity.nodes.others import Statuses
 from exo_gravity.nodes.ros.messages import NO_POSE, POSE_TO_CONFIRM
 
@@ -24,7 +24,7 @@ ENCLAVE = ("--ros-args", "--enclave", "/operator")  # what a person may do under
 
 def main() -> None:
     """Ask until Ctrl-C or the end of the terminal."""
-    keep_to_this_machine()
+    restrict_to_localhost()
     rclpy.init(args=[sys.argv[0], *ENCLAVE], signal_handler_options=SignalHandlerOptions.NO)
     node, say = rclpy.create_node("operator"), partial(print, flush=True)
     statuses, answered = Statuses(node), set[str]()  # the latter are the bridges whose present question was answered

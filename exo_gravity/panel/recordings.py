@@ -24,7 +24,7 @@ import yaml
 
 from exo_gravity.core.errors import ParameterError
 from exo_gravity.core.params import ROS_PARAMETERS
-from exo_gravity.core.safety.drive import State
+from exo_gravity.core.safety.command import State
 from exo_gravity.lab.inputs.ros_yaml import dumped, text_of
 from exo_gravity.lab.processes import Launcher, program
 from exo_gravity.lab.trial.session import Session, check_text

@@ -7,7 +7,7 @@ from collections.abc import Callable, Sequence
 
 from exo_gravity.core.compensation.compensator import Compensation, Compensator
 from exo_gravity.core.motors.joint_motor import JointSample
-from exo_gravity.core.safety.drive import NO_EFFORTS, Efforts
+from exo_gravity.core.safety.command import NO_EFFORTS, Efforts
 from exo_gravity.core.safety.limits import Limits
 from exo_gravity.core.vocabulary import NO_REASON
 from exo_gravity.hardware.control_loop import Controller

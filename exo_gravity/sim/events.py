@@ -12,7 +12,7 @@ from functools import partial
 
 from exo_gravity.core.arm.interface import Payload
 from exo_gravity.core.motors.frames import ID_BITS
-from exo_gravity.core.safety.drive import Efforts
+from exo_gravity.core.safety.command import Efforts
 from exo_gravity.sim.rig import HOLD, Act, Rig
 
 RAMP_STEPS = 20  # in which an IMU's error grows, or a motor warms

@@ -16,7 +16,7 @@ from exo_gravity.core.compensation.compensator import Compensator
 from exo_gravity.core.compensation.settings import Settings
 from exo_gravity.core.motors.frames import Frame
 from exo_gravity.core.motors.joint_motor import JointMotor
-from exo_gravity.core.safety.drive import State
+from exo_gravity.core.safety.command import State
 from exo_gravity.core.safety.limits import Limits
 from exo_gravity.hardware.can_port import message_of
 from exo_gravity.sim.controllers import DirectController, UnreliableController

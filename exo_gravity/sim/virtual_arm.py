@@ -16,7 +16,7 @@ from exo_gravity.core.arm.tilt import Tilt, gravity_in_trunk
 from exo_gravity.core.compensation.compensator import Compensator
 from exo_gravity.core.errors import ParameterError
 from exo_gravity.core.motors.joint_motor import JointMotor
-from exo_gravity.core.safety.drive import Drive
+from exo_gravity.core.safety.command import Command
 from exo_gravity.core.safety.limits import HANGING, Limits
 from exo_gravity.core.safety.machine import SafetyMachine
 from exo_gravity.hardware.can_port import CanPort
@@ -71,7 +71,7 @@ class VirtualArm:
         ports: Sequence[CanPort | None] | None = None,
         played: Played | None = None,
         look: Callable[[], None] | None = None,
-        note: Callable[[Drive], None] = lambda drive: None,
+        note: Callable[[Command], None] = lambda command: None,
         hand_over: Callable[[str], bool] = lambda reason: False,
     ) -> None:
         self.device = device

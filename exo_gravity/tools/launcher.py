@@ -25,7 +25,7 @@ from functools import partial
 
 from exo_gravity import require_ros
 from exo_gravity.core.errors import ExoGravityError
-from exo_gravity.hardware.network import keep_to_this_machine, kept_to_this_machine
+from exo_gravity.hardware.network import localhost_notice, restrict_to_localhost
 from exo_gravity.lab.inputs.node_checks import check_start
 from exo_gravity.lab.inputs.parameter_file import packaged_config
 from exo_gravity.lab.processes import (
@@ -87,7 +87,7 @@ def main(args: Sequence[str] | None = None) -> None:
     if os.environ.get("EXO_GRAVITY_SUPERVISED"):  # by `ros2 launch`, which holds our standard input open
         threading.Thread(target=_stop_with_parent, args=(stopping,), daemon=True).start()
     space, restarts = options.namespace.strip("/"), deque([-math.inf] * 3, maxlen=3)  # the latter in monotonic s
-    keep_to_this_machine()
+    restrict_to_localhost()
     try:
         while True:
             launcher = Launcher(
@@ -101,7 +101,7 @@ def main(args: Sequence[str] | None = None) -> None:
                 options.remap,
                 check_start,
             )
-            if sentence := kept_to_this_machine():
+            if sentence := localhost_notice():
                 print_line("launcher", sentence)
             with asking_on_terminal(launcher.asking, partial(print_line, "launcher")):
                 dead = launcher.run(stopping)

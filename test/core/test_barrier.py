@@ -1,5 +1,5 @@
 # Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
-"""The bounds of every drive: the last hand on it, the monitor of unexplained torque, and a joint that is let down."""
+"""The bounds of every command: the last hand on it, the monitor of unexplained torque, and a joint that is let down."""
 
 import math
 from collections.abc import Sequence
@@ -273,7 +273,7 @@ JUDGED: dict[str, tuple[Any, float, dict[str, Any]]] = {
             ("permitted at other joints", (3.0, 0.0, 3.0, 3.0), 0.2),
         )
     },
-    "as old as its ride while the wearer moves": (OLD, math.inf, {"theta": HANGING, "velocity": 2.0, "age": 0.18}),
+    "as old as is still used while the wearer moves": (OLD, math.inf, {"theta": HANGING, "velocity": 2.0, "age": 0.18}),
     "too old for its age": (OLD, 0.8, {"theta": HANGING, "velocity": 2.0}),
 }
 

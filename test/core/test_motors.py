@@ -396,10 +396,10 @@ RIGHT = {10: 1, 7: 0x11, 9: 4000, 21: 12.5, 22: 30.0, 23: 10.0}
 def test_a_register_that_is_not_as_the_file_says_hinders_a_start_with_what_to_set(number, value, sentence):
     boards = Boards([damiao()])
     boards.take(0, sample(1.0))
-    assert boards.hindrance(1.0, 250.0) == "motor 1 to tell its CTRL_MODE"
+    assert boards.setup_error(1.0, 250.0) == "motor 1 to tell its CTRL_MODE"
     for register, right in (RIGHT | {number: value}).items():
         boards.told(0, answer(register, right), 1.0)
-    assert re.search(sentence, boards.hindrance(1.0, 250.0)), boards.hindrance(1.0, 250.0)
+    assert re.search(sentence, boards.setup_error(1.0, 250.0)), boards.setup_error(1.0, 250.0)
 
 
 def test_settings_are_asked_for_one_by_one_and_again_after_a_while():
@@ -413,7 +413,7 @@ def test_settings_are_asked_for_one_by_one_and_again_after_a_while():
     assert asked == set(RIGHT) and boards.question(0, 1.0) == ()
     assert boards.question(0, 1.0 + CHECK.ask_again)
     boards.take(0, sample(2.5))
-    assert boards.hindrance(2.5, 250.0).startswith("motor 1 to tell its")
+    assert boards.setup_error(2.5, 250.0).startswith("motor 1 to tell its")
 
 
 RATE = 400.0  # Hz of the control loop
@@ -445,11 +445,11 @@ REPORTS = [  # a format, frames a second of each motor, for how many s, and what
 def test_a_board_that_reports_too_seldom_hinders_a_start_with_what_to_set(board, rates, seconds, sentence):
     """Each motor sends `rates` (Hz) frames a second."""
     boards = Boards(boards_of(board))
-    boards.hindrance(0.0, RATE)
+    boards.setup_error(0.0, RATE)
     for joint, rate in enumerate(rates):
         for count in range(int(seconds * rate)):
             boards.take(joint, sample(count / rate))
-    assert re.search(sentence, boards.hindrance(seconds, RATE))
+    assert re.search(sentence, boards.setup_error(seconds, RATE))
 
 
 HEARD = [  # of what kind and which frame of motor 3 is no reply, and what is said of it
@@ -467,11 +467,11 @@ HEARD = [  # of what kind and which frame of motor 3 is no reply, and what is sa
 def test_a_frame_in_place_of_replies_is_shown_until_the_motor_replies_or_falls_silent(kind, frame, said):
     boards = Boards(boards_of(MIT))
     boards.heard(2, kind, frame, 1.0)
-    assert boards.hindrance(1.5, RATE).startswith(f"motor 3 {said}")
-    assert boards.hindrance(2.1, RATE) == ""
+    assert boards.setup_error(1.5, RATE).startswith(f"motor 3 {said}")
+    assert boards.setup_error(2.1, RATE) == ""
     boards.heard(2, kind, frame, 3.0)
     boards.take(2, sample(3.1))
-    assert boards.hindrance(3.2, RATE) == ""
+    assert boards.setup_error(3.2, RATE) == ""
 
 
 @pytest.mark.parametrize(

@@ -14,8 +14,8 @@ from hypothesis import strategies as st
 
 from exo_gravity.core.arm.tilt import Tilt
 from exo_gravity.core.numbers import NO_TORQUE, Rate
-from exo_gravity.core.safety.drive import CARRYING, Fault, FaultCode, Send, State
-from exo_gravity.core.safety.explain import RIDE
+from exo_gravity.core.safety.command import CARRYING, Fault, FaultCode, Send, State
+from exo_gravity.core.safety.explain import STALE
 from exo_gravity.core.safety.guidance import GUIDANCE
 from exo_gravity.core.safety.lease import LEASE_TIME, Lease
 from exo_gravity.core.safety.limits import DAMPING, DAMPING_RATE, MAX_EFFORT_RATE
@@ -113,14 +113,14 @@ def see(state: State | None = None, fault: str | None = None, words: str = "") -
 
 def has(holds: Callable[[SafetyRun], bool]) -> Step:
     def check(arm: SafetyRun) -> None:
-        assert holds(arm), (arm.machine.state, arm.machine.fault, arm.drive)
+        assert holds(arm), (arm.machine.state, arm.machine.fault, arm.command)
 
     return check
 
 
 def never_entered(seconds: float) -> Step:
     """Run for `seconds`, in which the second motor is never switched on."""
-    return has(lambda arm: Send.ENTER not in [arm.cycle().drive.send[1] for _ in range(round(seconds / PERIOD))])
+    return has(lambda arm: Send.ENTER not in [arm.cycle().command.send[1] for _ in range(round(seconds / PERIOD))])
 
 
 def leans(pitch: float, roll: float = 0.0) -> Step:
@@ -129,7 +129,7 @@ def leans(pitch: float, roll: float = 0.0) -> Step:
 
 
 SMOOTH = has(lambda arm: max(arm.steps) <= MAX_EFFORT_RATE * PERIOD * 1.0001)
-ALL_OFF = has(lambda arm: arm.machine.is_off and not arm.drive.powered and arm.drive[:2] == OFF[:2])
+ALL_OFF = has(lambda arm: arm.machine.is_off and not arm.command.powered and arm.command[:2] == OFF[:2])
 DISABLED_AGAIN = (disable, wait(8.0), see(State.DISABLED))
 STILL = (0.0, *(abs(torque) / STILLNESS.speed for torque in EFFORT[1:]))  # Nm s/rad, of joints that are still
 FRESH, TOO_LATE = {"effort_age": 0.002, "held": False}, {"effort_age": LATE, "held": True}
@@ -162,9 +162,9 @@ FAULTS: list[tuple[FaultCode, Step]] = [
 ]
 ROWS: dict[str, Sequence[Step]] = {
     "a new machine keeps the motors off, and torque begins slowly and without a step": [
-        wait(1.0), see(State.DISABLED), has(lambda arm: arm.drive == OFF),
-        enable, wait(1.7), see(State.RAMPING_IN), has(lambda arm: abs(arm.drive.effort[1] + 2.0) < 0.15),
-        wait(1.0), has(lambda arm: arm.drive.effort == pytest.approx(EFFORT)), SMOOTH,
+        wait(1.0), see(State.DISABLED), has(lambda arm: arm.command == OFF),
+        enable, wait(1.7), see(State.RAMPING_IN), has(lambda arm: abs(arm.command.effort[1] + 2.0) < 0.15),
+        wait(1.0), has(lambda arm: arm.command.effort == pytest.approx(EFFORT)), SMOOTH,
     ],
     "the checks require a whole second without trouble": [
         enable, *[wait(0.9), let(silent={1}), wait(0.1), let(silent=set())] * 5, see(State.CHECKING),
@@ -192,12 +192,12 @@ ROWS: dict[str, Sequence[Step]] = {
     ],
     "a motor that is found off is switched on again, once, with damping and without torque": [
         carried, let(off={1}),
-        has(lambda arm: any(Send.ENTER in arm.cycle().drive.send for _ in range(15))),  # in 60 ms
-        has(lambda arm: arm.drive.send == (Send.COMMAND, Send.ENTER, Send.COMMAND, Send.COMMAND)),
+        has(lambda arm: any(Send.ENTER in arm.cycle().command.send for _ in range(15))),  # in 60 ms
+        has(lambda arm: arm.command.send == (Send.COMMAND, Send.ENTER, Send.COMMAND, Send.COMMAND)),
         see(fault="torque_not_delivered", words="b: -4.00 Nm commanded"),
-        has(lambda arm: abs(arm.drive.effort[1]) < 0.1),
+        has(lambda arm: abs(arm.command.effort[1]) < 0.1),
         reads(1, velocity=1.0), wait(0.3),  # it sinks
-        has(lambda arm: arm.drive.damping[1] > 3.0 and arm.drive.effort[1] < -3.0),
+        has(lambda arm: arm.command.damping[1] > 3.0 and arm.command.effort[1] < -3.0),
         lambda arm: arm.off.add(1), never_entered(2.0),
     ],
     "a motor with an error is not switched on again": [
@@ -216,16 +216,16 @@ ROWS: dict[str, Sequence[Step]] = {
     ],
     "a silent motor is damped and faded, and lowered from what it applies when it replies again": [
         carried, let(silent={1}), wait(0.5), see(State.LETTING_DOWN, "motor_silent"),
-        has(lambda arm: arm.drive.damping[1] == DAMPING and arm.drive.effort[1] == -4.0),
-        wait(5.0), has(lambda arm: arm.drive.damping[1] == DAMPING and -3.0 < arm.drive.effort[1] < -2.0),
-        wait(12.0), see(State.FAULT), has(lambda arm: arm.machine.is_unreached and arm.drive.powered),
-        has(lambda arm: arm.drive.send[1] is Send.COMMAND and arm.drive.effort == NO_TORQUE),
+        has(lambda arm: arm.command.damping[1] == DAMPING and arm.command.effort[1] == -4.0),
+        wait(5.0), has(lambda arm: arm.command.damping[1] == DAMPING and -3.0 < arm.command.effort[1] < -2.0),
+        wait(12.0), see(State.FAULT), has(lambda arm: arm.machine.is_unreached and arm.command.powered),
+        has(lambda arm: arm.command.send[1] is Send.COMMAND and arm.command.effort == NO_TORQUE),
         let(silent=set()), wait(0.05), see(State.LETTING_DOWN), until(State.FAULT, 20.0), wait(0.1), ALL_OFF,
         see(fault="motor_silent"),
     ],
     "a motor that lost its power while silent is not pushed when it replies again": [
         carried, let(silent={1}), wait(1.0), let(silent=set()), lambda arm: arm.applied.__setitem__(1, 0.0), wait(1.0),
-        has(lambda arm: max(map(abs, (arm.applied[1], arm.drive.effort[1]))) < 0.01),
+        has(lambda arm: max(map(abs, (arm.applied[1], arm.command.effort[1]))) < 0.01),
     ],
     "only the operator clears a fault, and clearing enables nothing": [
         carried, trip(FaultCode.BUS_ERROR), wait(8.0), has(lambda arm: not arm.machine.enable(arm.now)),
@@ -233,54 +233,54 @@ ROWS: dict[str, Sequence[Step]] = {
     ],
     "a fault with a later time than the next cycle does no harm": [
         carried, trip(FaultCode.BUS_ERROR, later=10 * PERIOD), wait(),
-        has(lambda arm: arm.drive.effort == pytest.approx(EFFORT)), see(State.LETTING_DOWN),
+        has(lambda arm: arm.command.effort == pytest.approx(EFFORT)), see(State.LETTING_DOWN),
     ],
     "the first fault stays": [
         carried, trip(FaultCode.BUS_ERROR), trip(FaultCode.MOTOR_SILENT), wait(8.0), see(fault="bus_error"),
     ],
     "torque exceeds neither its limit nor its rate": [
         carried, let(effort=(39.0, -39.0, 39.0, -39.0)), wait(1.0),
-        has(lambda arm: arm.drive.effort == (3.0, -9.0, 3.0, -3.0) and "max_effort (b)" in arm.machine.acted), SMOOTH,
+        has(lambda arm: arm.command.effort == (3.0, -9.0, 3.0, -3.0) and "max_effort (b)" in arm.machine.acted), SMOOTH,
     ],
     "a hot motor gets less torque": [
         carried, let(effort=(3.0, 9.0, 3.0, 3.0)), reads(1, temperature=75), wait(1.0),
-        has(lambda arm: arm.drive.effort[1] == pytest.approx(6.75) and "derating (b)" in arm.machine.acted),
+        has(lambda arm: arm.command.effort[1] == pytest.approx(6.75) and "derating (b)" in arm.machine.acted),
     ],
     "an arm that moves off as if it were empty is let down, and can be carried again": [
-        carried, wait(0.5), has(lambda arm: arm.drive.damping == STILL), move(2, 0.25, 0.9),
+        carried, wait(0.5), has(lambda arm: arm.command.damping == STILL), move(2, 0.25, 0.9),
         see(State.LETTING_DOWN, "load_missing"), until(State.FAULT), clear, enable, until(State.ACTIVE), see(fault=""),
     ],
     "the motors are switched off once nothing holds the arm and it rests": [
         carried, disable, move(2, -0.12, 0.02, is_felt=False),  # for 6 s, slower than the velocity's resolution
-        has(lambda arm: arm.drive.powered and arm.drive[:2] == OFF[:2]),
+        has(lambda arm: arm.command.powered and arm.command[:2] == OFF[:2]),
         wait(2.1), see(State.DISABLED), wait(0.1), ALL_OFF,
     ],
     "late efforts are ridden through under rising damping, which falls again": [
-        carried, wait(0.3), has(lambda arm: arm.drive.damping == STILL), let(effort_age=LATE), wait(),
-        has(lambda arm: 0.0 < min(arm.drive.damping) < 0.2),
-        wait(0.1), see(State.ACTIVE), has(lambda arm: arm.machine.ride.rides == 1),
-        has(lambda arm: min(arm.drive.damping) == pytest.approx(0.104 * DAMPING_RATE)),
-        has(lambda arm: arm.drive.effort == pytest.approx(EFFORT)),
-        let(**FRESH), wait(0.12), see(State.ACTIVE), has(lambda arm: arm.drive.damping == STILL),
+        carried, wait(0.3), has(lambda arm: arm.command.damping == STILL), let(effort_age=LATE), wait(),
+        has(lambda arm: 0.0 < min(arm.command.damping) < 0.2),
+        wait(0.1), see(State.ACTIVE), has(lambda arm: arm.machine.stale.count == 1),
+        has(lambda arm: min(arm.command.damping) == pytest.approx(0.104 * DAMPING_RATE)),
+        has(lambda arm: arm.command.effort == pytest.approx(EFFORT)),
+        let(**FRESH), wait(0.12), see(State.ACTIVE), has(lambda arm: arm.command.damping == STILL),
         has(lambda arm: max(arm.steps) <= 1e-6),
     ],
     **{
-        f"a ride on {name} ends": [
-            carried, let(**late), wait(RIDE.longest - PERIOD), see(State.ACTIVE),
+        f"stale efforts on {name} end": [
+            carried, let(**late), wait(STALE.longest - PERIOD), see(State.ACTIVE),
             wait(2 * PERIOD), see(State.LETTING_DOWN, "command_stale"),
         ]
         for name, late in {"a late tilt": {"held": True}, "late efforts": TOO_LATE}.items()
     },
     **{
         f"who is late more often than once in ten is let down: {name}": [
-            carried, *late_by_turns(20, 0.6, **late), see(State.ACTIVE), has(lambda arm: arm.machine.ride.rides == 20),
+            carried, *late_by_turns(20, 0.6, **late), see(State.ACTIVE), has(lambda arm: arm.machine.stale.count == 20),
             *late_by_turns(4, 0.2, **late), see(fault="command_stale"),
         ]
         for name, late in {"a late tilt": {"held": True}, "late efforts": TOO_LATE}.items()
     },
     "after a pause of the loop itself only the age of the efforts counts": [
-        carried, let(effort_age=0.1), stall(0.1), see(State.ACTIVE),  # no motor was asked; the ride has only begun
-        let(effort_age=RIDE.longest_age + PERIOD), wait(), see(fault="command_stale"),
+        carried, let(effort_age=0.1), stall(0.1), see(State.ACTIVE),  # no motor was asked; it has only begun
+        let(effort_age=STALE.longest_age + PERIOD), wait(), see(fault="command_stale"),
     ],
     **{
         f"after {code} resume carries the arm from where it is": [
@@ -316,8 +316,8 @@ ROWS: dict[str, Sequence[Step]] = {
         for cause, (spoil, words) in {
             "a silent motor": (let(silent={2}), "c: no reply"),
             "an arm that moves": (reads(1, velocity=0.15), "at rest"),
-            "a hindrance": (
-                lambda arm: setattr(arm.machine, "hindrance", "the watchdog to start"), "the watchdog to start",
+            "a setup error": (
+                lambda arm: setattr(arm.machine, "setup_error", "the watchdog to start"), "the watchdog to start",
             ),
             "no efforts": (let(effort=None), "effort commands"),
             "old efforts": (let(effort_age=0.06), "effort commands"),
@@ -327,8 +327,8 @@ ROWS: dict[str, Sequence[Step]] = {
         }.items()
     },
     "the calm second passes while the watchdog starts": [
-        lambda arm: setattr(arm.machine, "hindrance", Reason(Wait.WATCHDOG, "the watchdog to start")),
-        enable, wait(2.0), see(State.CHECKING), lambda arm: setattr(arm.machine, "hindrance", NO_REASON),
+        lambda arm: setattr(arm.machine, "setup_error", Reason(Wait.WATCHDOG, "the watchdog to start")),
+        enable, wait(2.0), see(State.CHECKING), lambda arm: setattr(arm.machine, "setup_error", NO_REASON),
         until(State.PROVING, 0.1),
     ],
     "the calm second passes while efforts are withheld, but for its end, which each gap restarts": [
@@ -398,8 +398,8 @@ ROWS: dict[str, Sequence[Step]] = {
     ],
     **{
         f"after {code} ({n}) the arm is let down gently, and the fault stays latched": [
-            carried, spoil, wait(0.15), see(State.LETTING_DOWN, code), has(lambda arm: arm.drive.powered),
-            has(lambda arm, code=code: min(arm.drive.damping) > 0.0 or code == "motor_silent"),
+            carried, spoil, wait(0.15), see(State.LETTING_DOWN, code), has(lambda arm: arm.command.powered),
+            has(lambda arm, code=code: min(arm.command.damping) > 0.0 or code == "motor_silent"),
             *map(reads, range(4)), let(silent=set(), effort=EFFORT, **FRESH), until(State.FAULT, 20.0), wait(0.1),
             ALL_OFF, SMOOTH, wait(1.0), see(State.FAULT, code),
         ]
@@ -408,8 +408,8 @@ ROWS: dict[str, Sequence[Step]] = {
     **{
         f"damping times speed stays within max_effort in an arm that is {state}": [
             carried, *steps, *(reads(n, velocity=3.6, position=LIMITS.position_max[n] - 0.02) for n in range(4)),
-            wait(2 * PERIOD), has(lambda arm: any(arm.drive.damping)),
-            has(lambda arm: np.all(3.6 * np.array(arm.drive.damping) <= np.array(LIMITS.max_effort) + 1e-9)),
+            wait(2 * PERIOD), has(lambda arm: any(arm.command.damping)),
+            has(lambda arm: np.all(3.6 * np.array(arm.command.damping) <= np.array(LIMITS.max_effort) + 1e-9)),
         ]
         for state, steps in (("carried", ()), ("let down", (disable, wait(0.5))))
     },
@@ -432,12 +432,12 @@ ROWS: dict[str, Sequence[Step]] = {
         f"confirm: a confirmation lapses and is asked for again when {name}": [
             enable, wait(0.5), has(lambda arm: arm.machine.pose.asked), confirm,
             has(lambda arm: not arm.machine.pose.asked),
-            lambda arm, hindrance=hindrance: setattr(arm.machine, "hindrance", hindrance),
+            lambda arm, setup_error=setup_error: setattr(arm.machine, "setup_error", setup_error),
             reads(3, position=moved, velocity=0.0), wait(waited),
-            lambda arm: setattr(arm.machine, "hindrance", NO_REASON), wait(2.0),
+            lambda arm: setattr(arm.machine, "setup_error", NO_REASON), wait(2.0),
             see(State.CHECKING), has(lambda arm: arm.machine.pose.asked),
         ]
-        for name, moved, waited, hindrance in (
+        for name, moved, waited, setup_error in (
             ("the arm moves", 0.1, 0.02, NO_REASON),
             ("time passes", 0.0, 11.0, Reason(Wait.WATCHDOG, "the watchdog to start")),
         )
@@ -490,20 +490,20 @@ def test_no_sequence_of_events_lets_torque_flow_without_fresh_input_or_step(even
 
 def check(arm: SafetyRun, had_fault: Fault | None) -> None:
     """Assert what must hold after every cycle; `had_fault`: a fault latched before it."""
-    machine, drive = arm.machine, arm.drive
-    assert all(map(math.isfinite, drive.effort))
-    assert all(abs(e) <= limit for e, limit in zip(drive.effort, LIMITS.max_effort, strict=True))
+    machine, command = arm.machine, arm.command
+    assert all(map(math.isfinite, command.effort))
+    assert all(abs(e) <= limit for e, limit in zip(command.effort, LIMITS.max_effort, strict=True))
     if machine.state in CARRYING:
         assert arm.effort is not None
-        assert arm.effort_age <= RIDE.longest_age + 1e-9
-        is_damped = machine.state is State.PROVING or min(drive.damping) > 0.0
+        assert arm.effort_age <= STALE.longest_age + 1e-9
+        is_damped = machine.state is State.PROVING or min(command.damping) > 0.0
         assert arm.effort_age <= LIMITS.command_timeout + 1e-9 or is_damped
         assert all(arm.now - joint.time <= LIMITS.reply_timeout + 1e-9 for joint in arm.joints)
         assert machine.fault is None
     elif machine.is_off:
-        assert not drive.powered and drive.effort == drive.damping == OFF.effort
+        assert not command.powered and command.effort == command.damping == OFF.effort
     elif machine.state is not State.LETTING_DOWN and not machine.is_unreached:
-        assert not any(send in (Send.ENTER, Send.CLEAR) for send in drive.send)
+        assert not any(send in (Send.ENTER, Send.CLEAR) for send in command.send)
     if had_fault:
         assert machine.fault == had_fault
 
@@ -513,17 +513,17 @@ def test_while_the_load_changes_only_a_joint_that_moves_is_damped_and_damping_ne
     run.effort = NO_TORQUE  # under which no joint is damped because it is still
     run.cycle(0.5)
     run.damped, speeds = True, (0.0, GUIDANCE.calm, -1.0, 0.4)
-    dampings = [run.drive.damping]
+    dampings = [run.command.damping]
     for step in range(100):
         if step == 50:
-            assert run.drive.damping[:2] == (0.0, 0.0)
-            assert run.drive.damping[2] == pytest.approx(GUIDANCE.brake)
-            assert 0.5 < 0.4 * run.drive.damping[3] < GUIDANCE.brake
+            assert run.command.damping[:2] == (0.0, 0.0)
+            assert run.command.damping[2] == pytest.approx(GUIDANCE.brake)
+            assert 0.5 < 0.4 * run.command.damping[3] < GUIDANCE.brake
             run.damped = False
         moved = min(49, step) * PERIOD
         run.changes = [{"position": v * moved, "velocity": v * run.damped} for v in speeds]
-        dampings.append(run.cycle().drive.damping)
-    assert run.drive.damping == NO_TORQUE
+        dampings.append(run.cycle().command.damping)
+    assert run.command.damping == NO_TORQUE
     assert np.abs(np.diff(dampings, axis=0)).max() <= DAMPING_RATE * PERIOD * 1.001
     assert run.machine.state is State.ACTIVE
 
@@ -544,7 +544,7 @@ class YieldingArm(SafetyRun):
 
     def cycle(self, seconds: float = PERIOD) -> YieldingArm:
         for _ in range(max(1, round(seconds / PERIOD))):
-            for i, (effort, mobility) in enumerate(zip(self.drive.effort, self.mobility, strict=True)):
+            for i, (effort, mobility) in enumerate(zip(self.command.effort, self.mobility, strict=True)):
                 self.largest_effort[i] = max(self.largest_effort[i], effort)
                 excess = effort - max(-0.45, min(0.45, effort))
                 self.position[i] += excess * mobility * PERIOD
@@ -599,7 +599,7 @@ def test_efforts_that_are_nan_while_signs_are_proven_compare_no_joints_and_are_r
     arm = YieldingArm(FASTER)
     arm.effort = (math.nan,) * 4
     assert arm.proven().fault_code == "command_impossible"
-    assert max(map(abs, arm.drive.effort)) < 0.1
+    assert max(map(abs, arm.command.effort)) < 0.1
 
 
 HANDS = {  # joint speed (rad/s) over time (s), friction (Nm), and the message to the wearer

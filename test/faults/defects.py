@@ -15,7 +15,7 @@ from dataclasses import dataclass, replace
 from typing import Any
 from unittest.mock import patch
 
-from exo_gravity.core.safety.drive import Send
+from exo_gravity.core.safety.command import Send
 from exo_gravity.core.safety.watch import Power
 
 STEP, MACHINE = (f"core.safety.machine:SafetyMachine.{name}" for name in ("step", "__init__"))
@@ -24,7 +24,7 @@ ARM_DESCENT, JOINT_DESCENT = (f"core.safety.descent:{name}" for name in ("ArmDes
 DESCENT = "core.safety.descent:DESCENT"  # its tuning
 DELIVERY = "core.safety.watch:JointWatch.judge_torque"
 SENT = "core.safety.watch:SENT"  # what a motor is sent in each state
-RIDE, RIDING = (f"core.safety.explain:RideThrough.{name}" for name in ("step", "is_riding"))
+STALE, USED = (f"core.safety.explain:StaleEfforts.{name}" for name in ("step", "are_used"))
 MONITOR, MOTION = "core.safety.explain:MotionMonitor.step", "core.safety.explain:MOTION"
 WALL = "core.safety.shape:JointShaper._wall"
 LEASE = "core.safety.lease:Lease.lost"
@@ -112,15 +112,15 @@ def first_joint_only(applied: property) -> property:
     return property(damped)
 
 
-def off_after_a_fault(drive: Any, machine: Any, *_: Any) -> Any:
-    is_off = machine.state == "letting down" and machine.fault
-    return type(drive).off(len(drive.effort))._replace(send=(Send.EXIT,) * len(drive.effort)) if is_off else drive
+def off_after_a_fault(command: Any, machine: Any, *_: Any) -> Any:
+    is_off, count = machine.state == "letting down" and machine.fault, len(command.effort)
+    return type(command).off(count)._replace(send=(Send.EXIT,) * count) if is_off else command
 
 
-def without_enter(drive: Any, machine: Any, *_: Any) -> Any:
+def without_enter(command: Any, machine: Any, *_: Any) -> Any:
     if machine.state != "letting down":
-        return drive
-    return drive._replace(send=tuple(Send.COMMAND if send is Send.ENTER else send for send in drive.send))
+        return command
+    return command._replace(send=tuple(Send.COMMAND if send is Send.ENTER else send for send in command.send))
 
 
 def replies_with_torque(judge: Callable[..., str]) -> Callable[..., str]:
@@ -145,8 +145,8 @@ def commands_unsure(sent: dict[Power, tuple[Send, Send]]) -> dict[Power, tuple[S
     return {**sent, Power.UNSURE: (Send.ENTER, Send.COMMAND)}
 
 
-def rides_on(fault: Any, ride: Any, *_: Any) -> None:
-    ride.is_riding = ride.is_riding or fault is not None
+def used_on(fault: Any, stale: Any, *_: Any) -> None:
+    stale.are_used = stale.are_used or fault is not None
 
 
 def clamped(answer: Any, compensator: Any, *_: Any) -> Any:
@@ -195,9 +195,9 @@ DEFECTS = (
         ("motor 2 restarts in 30 ms",),
         {DELIVERY: replies_with_torque},
     ),
-    Defect("stale efforts are accepted", (FROZEN,), {RIDE: returns(None)}),
-    Defect("a ride that never ends", (FROZEN,), {RIDE: after(rides_on)}),
-    Defect("a ride without damping", ("compensator stopped for 0.1 s",), {RIDING: always(False)}),
+    Defect("stale efforts are accepted", (FROZEN,), {STALE: returns(None)}),
+    Defect("stale efforts are used for ever", (FROZEN,), {STALE: after(used_on)}),
+    Defect("stale efforts without damping", ("compensator stopped for 0.1 s",), {USED: always(False)}),
     Defect(
         "zeros once checked are always trusted",
         ("joint 2 jumps by a motor turn, then clear and enable",),

@@ -26,7 +26,7 @@ from sensor_msgs.msg import Imu, JointState
 
 from exo_gravity.core.motors.joint_motor import JointMotor, motors_of
 from exo_gravity.core.safety.limits import CAN_BRIDGE
-from exo_gravity.hardware.clock import favour
+from exo_gravity.hardware.clock import raise_priority
 from exo_gravity.lab.inputs.arms import node_values
 from exo_gravity.lab.inputs.parameter_file import load
 from exo_gravity.sim.judge import MAX_SPEED, measure
@@ -100,7 +100,7 @@ class ProcessRig:
     run = staticmethod(time.sleep)
 
     def __init__(self, arm: Arm, folder: Path) -> None:
-        favour(5)  # what the probe receives is in time
+        raise_priority(5)  # what the probe receives is in time
         self.arm, self.folder = arm, folder
         self.script = self.write_script("pose", [{"move": list(arm.pose), "over": 1.0}, {"hold": 600.0}])
         home = [0.0, *[0.05] * (len(arm.pose) - 1)]

@@ -13,7 +13,7 @@ import can
 import numpy as np
 
 from exo_gravity.core.motors.damiao import DAMIAO_MIT
-from exo_gravity.core.safety.drive import Efforts, FaultCode, State
+from exo_gravity.core.safety.command import Efforts, FaultCode, State
 from exo_gravity.core.safety.lease import Lease
 from exo_gravity.lab.inputs.arms import node_values, read_arm
 from exo_gravity.lab.inputs.parameter_file import Nodes, load

@@ -12,7 +12,7 @@ import numpy as np
 from exo_gravity.core import ArmModel
 from exo_gravity.core.arm.wearer import Wearer
 from exo_gravity.core.motors.frames import SET_ZERO
-from exo_gravity.core.safety.drive import State
+from exo_gravity.core.safety.command import State
 from exo_gravity.core.safety.limits import CONFIRM
 from exo_gravity.lab.inputs.parameter_file import load
 from exo_gravity.sim.events import ACTS
@@ -62,7 +62,7 @@ BLIND = 30.0  # s, longer than a let-down waits for motors that do not reply
 LAP = [0.1, 0.3, 0.3, 1.3]  # rad, near to hanging but for the elbow, which then reads 0.25
 OFF = ("disabled",)
 UNEXPLAINED = ("unexplained_torque",)
-RIDE = 0.5  # s from the fault, in which the motors have damped and are free again
+STALE = 0.5  # s from the fault, in which the motors have damped and are free again
 TREMOR = 2.0  # Nm
 STEADY = MOVED = GUIDED_SPEED = 0.6  # rad/s
 MOTION = 8.0  # s until an arm that became heavy hangs
@@ -160,9 +160,9 @@ def stays_off(records: np.ndarray) -> str:
 def damped_for_a_moment(records: np.ndarray) -> str:
     """Return what is wrong unless every motor damps the motion for a moment, and then no more than before."""
     since, damping = records["time"] - records["time"][0], records["damping"]
-    if damping[since < RIDE].max(axis=0, initial=0.0).min() < 0.1:  # Nm s/rad
+    if damping[since < STALE].max(axis=0, initial=0.0).min() < 0.1:  # Nm s/rad
         return "ridden through without damping"
-    return "still damped after the ride" if (damping[since > RIDE] > damping[0] + 0.01).any() else ""
+    return "still damped afterwards" if (damping[since > STALE] > damping[0] + 0.01).any() else ""
 
 
 def within_max_effort(records: np.ndarray) -> str:

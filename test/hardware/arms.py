@@ -21,9 +21,9 @@ from exo_gravity.core.errors import BusError
 from exo_gravity.core.motors.ak import MIT
 from exo_gravity.core.motors.frames import WireFormat
 from exo_gravity.core.motors.joint_motor import Address, JointMotor, channels_of
-from exo_gravity.core.safety.drive import State
+from exo_gravity.core.safety.command import State
 from exo_gravity.core.safety.limits import Limits
-from exo_gravity.hardware.bus_lock import DriveNotes
+from exo_gravity.hardware.bus_lock import CommandNotes
 from exo_gravity.hardware.can_port import ArmOnBus, CanPort, open_bus
 from exo_gravity.hardware.motor_bus import MotorBus
 from exo_gravity.sim import ArmConfig, SimulatedMotor
@@ -167,7 +167,7 @@ class CarriedArm(JudgedArm):
         wire = Wire(start=0.0, bitrate=bitrate, echoes=echoes)
         self.wires = {name: wire if name == channels[0] else Wire(wire.clock) for name in dict.fromkeys(channels)}
         self.on_bus = ArmOnWires(("wire", channel, {"fd": True} if is_fd else {}), joints, kept, 1.0 / rate, self.wires)
-        self.notes = DriveNotes.from_buffer(bytearray(ctypes.sizeof(DriveNotes)))
+        self.notes = CommandNotes.from_buffer(bytearray(ctypes.sizeof(CommandNotes)))
         self.notes.clock = wire.clock
         played = None
         for name, end in self.wires.items():

@@ -14,7 +14,7 @@ from pathlib import Path
 from exo_gravity.hardware.motor_bus import MotorBus
 from exo_gravity.hardware.owned_bus import OwnedBus
 
-from ..support.simulated_device import drive_of
+from ..support.simulated_device import command_of
 
 arm, effort = pickle.loads(Path(sys.argv[1]).read_bytes())
 log = partial(print, file=sys.stderr, flush=True)
@@ -23,7 +23,7 @@ bus = MotorBus(arm.ports(owned.notes.clock), arm.motors, note=owned.notes.note) 
 is_announced = False
 while True:
     end = time.monotonic() + arm.period
-    bus.exchange(drive_of(effort), end)
+    bus.exchange(command_of(effort), end)
     if not is_announced and owned.notes.heartbeat and all(joint.time > 0.0 for joint in bus.samples):
         print(owned.watchdog.process.pid, flush=True)
         is_announced = True

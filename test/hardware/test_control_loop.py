@@ -15,7 +15,7 @@ from exo_gravity.core.errors import BusError
 from exo_gravity.core.motors.ak import MIT, MIT_V3
 from exo_gravity.core.motors.frames import WireFormat
 from exo_gravity.core.numbers import NO_TORQUE
-from exo_gravity.core.safety.drive import FaultCode, State
+from exo_gravity.core.safety.command import FaultCode, State
 from exo_gravity.core.safety.limits import DAMPING
 from exo_gravity.core.safety.machine import SafetyMachine
 from exo_gravity.core.safety.watch import Power
@@ -27,7 +27,7 @@ from exo_gravity.hardware.motor_bus import FOREIGN_COMMAND, MotorBus
 from exo_gravity.hardware.request_age import AGE, Requests
 from exo_gravity.sim.virtual_time import VirtualBus
 
-from ..support.simulated_device import drive_of
+from ..support.simulated_device import command_of
 from ..support.thorough import quick
 from .arms import (
     CYCLE,
@@ -64,18 +64,18 @@ def test_an_arm_is_let_down_after_its_computer_was_suspended():
 
 def test_a_bus_that_fails_is_opened_again_and_the_torque_continues_from_what_the_motors_hold():
     arm = raised()
-    held = arm.notes.drive.effort[1]
+    held = arm.notes.command.effort[1]
     arm.wire.refusal = BusError("no such device")
     arm.wire.break_down(ValueError("garbled line"))
     assert arm.run_until(lambda: arm.safety.is_unreached)
     assert arm.fault == "bus_error" and "garbled line" in arm.safety.fault.reason
     arm.run(1.0)
-    assert all(arm.motors_on) and not arm.loop.is_off and arm.notes.drive.powered
+    assert all(arm.motors_on) and not arm.loop.is_off and arm.notes.command.powered
     arm.wire.refusal = None
     assert arm.run_until(lambda: arm.wire.opened == 2)
     for _ in range(5):
         arm.cycle()
-        assert abs(arm.notes.drive.effort[1] - held) < 0.3
+        assert abs(arm.notes.command.effort[1] - held) < 0.3
     arm.assert_let_down()
 
 
@@ -139,7 +139,7 @@ def test_a_failing_state_machine_hands_the_arm_over_to_the_watchdog_and_sends_no
     with pytest.raises(Killed):
         arm.run(1.0)
     assert all(len(message.data) == 8 and message.data[0] < 5 for message in listeners[0].received)  # replies
-    assert all(arm.motors_on) and arm.notes.drive.powered
+    assert all(arm.motors_on) and arm.notes.command.powered
     assert isinstance(arm.loop.failure, ZeroDivisionError)
 
 
@@ -211,7 +211,7 @@ def test_both_buses_are_sent_their_commands_before_the_replies_of_either_are_awa
         wire.batch = 0.003  # the adapters deliver both together
     for _ in range(20):
         start = arm.now
-        assert arm.bus.exchange(drive_of(NO_TORQUE), start + 0.007)
+        assert arm.bus.exchange(command_of(NO_TORQUE), start + 0.007)
         assert arm.now - start < 0.005
 
 

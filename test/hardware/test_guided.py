@@ -16,7 +16,7 @@ from exo_gravity.core.compensation.terms.assist import Assist
 from exo_gravity.core.compensation.terms.catalogue import Friction, Inertia, Spring
 from exo_gravity.core.compensation.terms.terms import SUM, TermSettings
 from exo_gravity.core.numbers import NO_TORQUE
-from exo_gravity.core.safety.drive import State
+from exo_gravity.core.safety.command import State
 from exo_gravity.core.safety.explain import MOTION
 from exo_gravity.sim import VirtualWearer
 from exo_gravity.sim.arm import DEFAULT_LINKS

@@ -25,14 +25,14 @@ from exo_gravity.core.motors.frames import (
 )
 from exo_gravity.core.motors.joint_motor import LARGEST_WARMING, JointMotor
 from exo_gravity.core.numbers import NO_TORQUE
-from exo_gravity.core.safety.drive import Drive, Send, State
+from exo_gravity.core.safety.command import Command, Send, State
 from exo_gravity.core.safety.limits import DAMPING
 from exo_gravity.hardware.can_port import CanPort
 from exo_gravity.hardware.motor_bus import CONTEST_TIME, HOLD_STIFFNESS, WARMING, MotorBus
 from exo_gravity.sim import ArmConfig, Firmware, SimulatedArm, SimulatedDevice, SimulatedMotor
 from exo_gravity.sim.virtual_time import VirtualBus, Wire
 
-from ..support.simulated_device import OFF, drive_of, frame, joints_of, sending
+from ..support.simulated_device import OFF, command_of, frame, joints_of, sending
 from .arms import CarriedArm, motor_bus
 
 AK60 = MOTORS["AK60-6"]
@@ -40,7 +40,7 @@ MOUNTED = (("AK60-6", 1, 0.0), ("AK80-9", -1, 0.4), ("AK60-6", 1, -0.2), ("AK60-
 MOTORS_OF_ARM = tuple(JointMotor(MOTORS[name], n, *mounted) for n, (name, *mounted) in enumerate(MOUNTED, 1))
 LINKS = ArmConfig().links
 WEIGHTLESS = ArmModel(LINKS.length, LINKS.cog, LINKS.mass, gravity=0.0)  # stays in place, however slow the machine is
-ON = drive_of(NO_TORQUE)
+ON = command_of(NO_TORQUE)
 POSE = (0.1, 0.2, 0.3, 0.4)  # rad
 
 
@@ -211,7 +211,7 @@ def test_a_command_that_we_sent_is_an_echo_when_it_comes_back_once() -> None:
 
 MIXED = (MIT, MIT_V3, MIT_V3, MIT)
 V3 = (MIT_V3,) * 4
-CARRYING = drive_of((0.0, 0.5, 0.4, 0.0))
+CARRYING = command_of((0.0, 0.5, 0.4, 0.0))
 
 
 REPLYING = [(reply, length) for reply in (False, True) for length in (8, 7, 6)]
@@ -260,7 +260,7 @@ def test_another_host_that_drives_motors_which_are_off_is_a_fault_until_it_stops
 # Motors whose torque depends on their temperature, judged by what the motors give.
 
 SLOPE, EFFORT = -0.0015, (1.0, -4.0, 1.5, -0.8)
-WARM = drive_of(EFFORT)
+WARM = command_of(EFFORT)
 WARM_MOTORS = tuple(replace(motor, torque_scale=0.9, scale_slope=SLOPE) for motor in MOTORS_OF_ARM)
 HALF_A_CODE = np.array([motor.spec.torque_range / 4095 * motor.torque_scale for motor in WARM_MOTORS])
 
@@ -273,12 +273,12 @@ class WarmBus(MotorBus):
         self.device, self.heard = play(wire, WARM_MOTORS, firmware), wire.open()
         super().__init__([CanPort(wire.open(), wire.clock)] * len(WARM_MOTORS), WARM_MOTORS, clock=wire.clock)
 
-    def cycle(self, temperature: float, drive: Drive = WARM) -> np.ndarray:
-        """Command a drive for a cycle of 10 ms at a temperature in degC; return the true torque (4,) in Nm."""
+    def cycle(self, temperature: float, command: Command = WARM) -> np.ndarray:
+        """Send a command for a cycle of 10 ms at a temperature in degC; return the true torque (4,) in Nm."""
         for motor in self.device.motors:
             motor.temperature = motor.ambient = temperature
         end = self.clock.monotonic() + 0.01
-        self.exchange(drive, end)
+        self.exchange(command, end)
         self.receive_until(end)
         return np.array([motor.torque(0.0, 0.0) for motor in self.device.motors])
 
@@ -286,8 +286,8 @@ class WarmBus(MotorBus):
 @pytest.mark.parametrize("temperature", [5.0, 25.0, 70.0])
 def test_a_motor_of_any_temperature_gives_and_reports_the_torque_asked_for_within_half_a_code(temperature):
     bus = WarmBus()
-    for drive in (sending(Send.ENTER), WARM):
-        bus.cycle(temperature, drive)
+    for command in (sending(Send.ENTER), WARM):
+        bus.cycle(temperature, command)
     true = bus.cycle(temperature)
     reported = np.array([sample.effort for sample in bus.samples])
     assert np.all(np.abs((true - EFFORT, reported - true)) <= 1.1 * HALF_A_CODE)
@@ -298,8 +298,8 @@ def test_a_motor_of_any_temperature_gives_and_reports_the_torque_asked_for_withi
 
 def test_a_reading_that_jumps_moves_the_torque_no_faster_than_a_motor_warms():
     bus = WarmBus()
-    for drive in (sending(Send.ENTER), WARM):
-        bus.cycle(30.0, drive)
+    for command in (sending(Send.ENTER), WARM):
+        bus.cycle(30.0, command)
     for _ in range(100):
         bus.cycle(215.0)  # as a sensor reads whose wire is broken
     last = [data for can_id, data in sent(bus.heard) if can_id == 2][-1]

@@ -25,7 +25,7 @@ from exo_gravity.core.motors.damiao import (
 from exo_gravity.core.motors.families import FORMATS, MOTORS
 from exo_gravity.core.motors.frames import ENTER
 from exo_gravity.core.motors.joint_motor import JointMotor
-from exo_gravity.core.safety.drive import FaultCode, State
+from exo_gravity.core.safety.command import FaultCode, State
 from exo_gravity.lab.inputs.arms import node_values, read_arm
 from exo_gravity.lab.inputs.parameter_file import load, packaged_config
 from exo_gravity.sim.device import SimulatedDevice

@@ -25,7 +25,7 @@ from exo_gravity.core.safety.limits import MAX_EFFORT_RATE
 from exo_gravity.hardware import bus_lock, owned_bus
 from exo_gravity.hardware.bus_lock import (
     ATTEMPT_TIME,
-    UNKNOWN_DRIVE,
+    UNKNOWN_COMMAND,
     ArmNotes,
     BusLock,
     bridge_of,
@@ -38,7 +38,7 @@ from exo_gravity.sim.events import ACTS
 from exo_gravity.sim.virtual_time import VirtualBus, VirtualClock
 
 from ..support.copies import copied
-from ..support.simulated_device import OFF, drive_of
+from ..support.simulated_device import OFF, command_of
 from ..support.thorough import quick
 from .arms import (
     CYCLE,
@@ -58,7 +58,7 @@ from .arms import raised_arm as raised
 
 CHANNEL = f"can{os.getpid()}"  # other test runs share the network namespace
 CAN0 = ("socketcan", CHANNEL, {})
-DRIVE = drive_of((0.0, 3.0, 1.0, 0.5), (0.0, 5.0, 0.0, 0.0))
+NOTED = command_of((0.0, 3.0, 1.0, 0.5), (0.0, 5.0, 0.0, 0.0))
 ENDED = "the last can_bridge on this bus and its watchdog ended with the motors on: letting the arm down"
 OWNER = f"/right/can_bridge (PID {os.getpid()})"
 # Prints why a process of another session, with other folders, may not have the bus.
@@ -84,10 +84,10 @@ def lock_of(owner: str, **options: bool) -> BusLock:
 def test_a_held_bus_is_refused_with_its_owner_whose_notes_stay_and_free_again_after_its_release():
     assert bridge_of(CAN0) == ""
     lock = lock_of(OWNER)
-    lock.notes.note(DRIVE)
+    lock.notes.note(NOTED)
     with pytest.raises(BusError, match=f"^CAN bus {CHANNEL} is held by {re.escape(OWNER)}$"):
         lock_of("/left/can_bridge (PID 124)")
-    assert (lock.notes.drive, lock.notes.owner, bridge_of(CAN0)) == (DRIVE, OWNER, OWNER)
+    assert (lock.notes.command, lock.notes.owner, bridge_of(CAN0)) == (NOTED, OWNER, OWNER)
     BusLock(("socketcan", f"{CHANNEL}x", {}), "another").release()
     lock.release()
     assert bridge_of(CAN0) == ""
@@ -125,12 +125,12 @@ def test_a_bus_is_asked_for_only_while_someone_waits_for_it(asks):
 
 def test_the_notes_outlive_their_owner_unless_the_motors_are_off(lock_folder):
     lock = lock_of("first")
-    assert not lock.notes.drive.powered and not lock.problem
+    assert not lock.notes.command.powered and not lock.problem
     assert stat.S_IMODE(notes_file(CAN0).stat().st_mode) == 0o666  # the next owner may be another user
-    lock.notes.note(DRIVE)
+    lock.notes.note(NOTED)
     lock.release()
     lock = lock_of("second")
-    assert lock.notes.drive == DRIVE
+    assert lock.notes.command == NOTED
     lock.notes.note(OFF)
     lock.release()
     assert not list(lock_folder.iterdir())
@@ -155,7 +155,7 @@ def test_motors_whose_notes_cannot_be_trusted_may_be_on(obstacle, lock_folder):
     OBSTACLES[obstacle](notes_file(CAN0), other)
     lock = lock_of("first")
     assert str(notes_file(CAN0)) in lock.problem
-    assert lock.notes.drive == UNKNOWN_DRIVE and lock.notes.drive.powered
+    assert lock.notes.command == UNKNOWN_COMMAND and lock.notes.command.powered
     lock.release()
     assert other.read_bytes() == b"precious"
 
@@ -181,10 +181,10 @@ def test_the_notes_are_in_the_first_folder_that_every_user_may_write_to(monkeypa
 
 def leave_on(arm: CarriedArm) -> None:
     """Leave the notes of a bridge that died with its watchdog, on each bus; of other buses they know nothing."""
-    effort = arm.notes.drive.effort
+    effort = arm.notes.command.effort
     for part in arm.on_bus.parts:
         lock = BusLock(part.address, "a dead bridge")
-        lock.notes.note(drive_of([torque if joint in part.joints else 7.0 for joint, torque in enumerate(effort)]))
+        lock.notes.note(command_of([torque if joint in part.joints else 7.0 for joint, torque in enumerate(effort)]))
         lock.release()
 
 
@@ -192,7 +192,7 @@ def test_a_second_owner_sends_no_frame_and_the_first_keeps_carrying():
     arm = raised().leave()
     owned = OwnedBus(arm.on_bus, OWNER, print, arm.clock)
     bus = owned.open()
-    bus.exchange(drive_of(arm.notes.drive.effort), arm.now + 1.0)
+    bus.exchange(command_of(arm.notes.command.effort), arm.now + 1.0)
     arm.clock.sleep(0.01)  # until the last replies
     listener = Responder(arm.wire)
     with pytest.raises(BusError, match="held by /right/can_bridge"):
@@ -245,7 +245,7 @@ def test_the_arm_that_a_dead_owner_left_with_its_motors_on_is_let_down_first(own
 def powered(address: Address) -> bool:
     """Return whether the notes of a bus say that its motors may be on."""
     lock = BusLock(address, "a test")
-    found = lock.notes.drive.powered
+    found = lock.notes.command.powered
     lock.release()
     return found
 
@@ -263,7 +263,7 @@ def test_a_watchdog_stays_with_what_the_next_owner_cannot_reach(monkeypatch, cha
 
     class Stays(NoWatchdog):
         def __init__(self, lock: ArmLock, *_: object) -> None:
-            stayed.append([own.notes.drive.powered for own in lock.of_joints])
+            stayed.append([own.notes.command.powered for own in lock.of_joints])
 
     monkeypatch.setattr(owned_bus, "Watchdog", Stays)
     leave_on(arm)
@@ -327,22 +327,22 @@ def commands(listener: Responder, can_id: int) -> list[MotorCommand]:
 
 def test_the_arm_is_lowered_from_the_noted_torques_and_damping_and_its_motors_are_switched_off():
     arm = raised().leave()
-    held, listener = arm.notes.drive.effort, Responder(arm.wire)
-    arm.notes.note(drive_of(held, (5.0,) * 4))
+    held, listener = arm.notes.command.effort, Responder(arm.wire)
+    arm.notes.note(command_of(held, (5.0,) * 4))
     assert lowered(arm)
     sent = commands(listener, 2)
     assert sent[0].torque == pytest.approx(held[1], abs=0.1)  # the damping of half a code
     assert min(command.kd for command in sent[:50]) == pytest.approx(5.0, abs=0.01)
     largest = max(abs(after.torque - before.torque) for before, after in itertools.pairwise(sent))
     assert largest <= MAX_EFFORT_RATE * CYCLE + 2 * MOTORS["AK80-9"].torque_range / 4095
-    assert not arm.notes.drive.powered
+    assert not arm.notes.command.powered
     arm.assert_down()
 
 
 def test_a_motor_that_has_lost_its_power_is_not_pushed_by_the_noted_torque():
     """The operator cut the supply: the motors are off, and the arm hangs."""
     arm = CarriedArm().leave()
-    arm.notes.note(drive_of((0.0, 6.0, 2.0, 1.0)))
+    arm.notes.note(command_of((0.0, 6.0, 2.0, 1.0)))
     assert lowered(arm)
     assert arm.fastest < 0.01 and not arm.device.powered
 
@@ -388,7 +388,7 @@ def test_an_arm_on_two_buses_is_let_down_as_one(wire_format: WireFormat) -> None
     """Motors 3 and 4 hold next to nothing here: they must still be braked while the first bus lowers joint 2."""
     worn: dict[str, Any] = {"has_wearer": False, "mode": "one_g", "channel": ON_TWO, "wire_format": wire_format}
     arm = raised_usual_arm((0.0, 1.3, 0.0, 0.3), **worn).leave()
-    carrying = arm.notes.drive.effort
+    carrying = arm.notes.command.effort
     assert max(map(abs, carrying[2:])) < 0.1 and carrying[1] > 3.0
     near, far = copied(arm.notes), copied(arm.notes)
     near.clock = far.clock = arm.clock
@@ -399,7 +399,7 @@ def test_an_arm_on_two_buses_is_let_down_as_one(wire_format: WireFormat) -> None
     assert let_down(arm.on_bus, ArmNotes([near, near, far, far]), print, lambda: False)
     assert min(damped) > 1.0
     assert all(any(each[:2]) == any(each[2:]) for each in on)
-    assert not near.drive.powered and not far.drive.powered and not arm.device.powered and arm.fastest < SAFE_SPEED
+    assert not near.command.powered and not far.command.powered and not arm.device.powered and arm.fastest < SAFE_SPEED
 
 
 UNREACHED: list[tuple[WireFormat, Callable[[CarriedArm], None], str]] = [
@@ -422,8 +422,8 @@ def test_a_bus_that_is_lost_is_handed_over_and_does_not_keep_the_other_waiting(w
     other = Responder(arm.wire)
     assert not let_down(arm.on_bus, ArmNotes([near, near, far, far]), log.append, lambda: True)
     assert said in log[0]
-    assert arm.motors_on == [True, True, False, False] and near.drive.powered
-    assert far.drive.powered == (not arm.wire.refusal)
+    assert arm.motors_on == [True, True, False, False] and near.command.powered
+    assert far.command.powered == (not arm.wire.refusal)
     if not arm.wire.refusal:
         return
     # Status frames of V3 boards alone.

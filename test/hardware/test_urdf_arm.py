@@ -22,10 +22,10 @@ from exo_gravity.core.arm.tilt import SIDES, Tilt
 from exo_gravity.core.compensation.settings import Settings, compensator_table, settings_of
 from exo_gravity.core.errors import ParameterError
 from exo_gravity.core.params import values_of
-from exo_gravity.core.safety.drive import Drive, Send
+from exo_gravity.core.safety.command import Command, Send
 from exo_gravity.core.safety.explain import GRAVITY, MotionMonitor
 from exo_gravity.core.safety.limits import DAMPING, Limits
-from exo_gravity.hardware.bus_lock import ArmNotes, DriveNotes
+from exo_gravity.hardware.bus_lock import ArmNotes, CommandNotes
 from exo_gravity.hardware.urdf_arm import UrdfArm
 from exo_gravity.lab.inputs.arms import configured_arm
 from exo_gravity.lab.inputs.parameter_file import packaged_config
@@ -368,11 +368,11 @@ def settings_for(text: str, names: Sequence[str], **given: object) -> Settings:
 
 
 def test_notes_of_an_arm_with_another_number_of_joints_are_no_torque_for_this_one() -> None:
-    notes = DriveNotes.from_buffer(bytearray(ctypes.sizeof(DriveNotes)))
-    assert not ArmNotes([notes] * 2).drive.powered
-    notes.note(Drive((1.0, 2.0, 3.0), (0.5,) * 3, (Send.COMMAND,) * 3, True))
-    assert ArmNotes([notes] * 3).drive == notes.drive
-    assert ArmNotes([notes] * 2).drive == Drive((0.0,) * 2, (DAMPING,) * 2, (Send.COMMAND,) * 2, True)
+    notes = CommandNotes.from_buffer(bytearray(ctypes.sizeof(CommandNotes)))
+    assert not ArmNotes([notes] * 2).command.powered
+    notes.note(Command((1.0, 2.0, 3.0), (0.5,) * 3, (Send.COMMAND,) * 3, True))
+    assert ArmNotes([notes] * 3).command == notes.command
+    assert ArmNotes([notes] * 2).command == Command((0.0,) * 2, (DAMPING,) * 2, (Send.COMMAND,) * 2, True)
 
 
 @pytest.mark.parametrize("held", [{}, {"payload.mass": 1.5, "payload.cog": [0.02, -0.03, 0.05]}])

@@ -26,7 +26,7 @@ from exo_gravity.hardware.watchdog import SleepInhibitor, guard
 from exo_gravity.sim.virtual_time import VirtualClock
 
 from ..support.launched_nodes import children
-from ..support.simulated_device import OFF, drive_of
+from ..support.simulated_device import OFF, command_of
 from ..support.waiting import PATIENCE, wait_until
 from .arms import CYCLE, Responder, SimulatedRig
 from .arms import raised_arm as raised
@@ -67,8 +67,8 @@ class Bridge:
         self.killed: list[float] = []
         self.log: list[str] = []
         self.inhibited: list[bool] = []
-        self.drive = drive_of(self.notes.drive.effort)
-        self.freeze = self.clock.every(CYCLE, lambda: self.notes.note(self.drive))
+        self.command = command_of(self.notes.command.effort)
+        self.freeze = self.clock.every(CYCLE, lambda: self.notes.note(self.command))
         self.listener = Responder(self.arm.wire)
 
     def kill(self) -> None:
@@ -138,7 +138,7 @@ def test_the_arm_of_a_bridge_that_has_ended_is_let_down_under_the_watchdogs_name
     assert [0.0 <= time - when < (within or 0.0) for time in bridge.killed] == [True] * (within is not None)
     assert bridge.log == [f"can_bridge {said}: {LET_DOWN[0]}", LET_DOWN[1]]
     assert "of /right/can_bridge (PID 1); it is letting the arm down" in bridge.notes.owner
-    assert not bridge.notes.drive.powered
+    assert not bridge.notes.command.powered
     bridge.arm.assert_down()
 
 
@@ -151,9 +151,9 @@ def test_a_watchdog_whose_motors_are_silent_hands_the_bus_over_and_the_next_brid
     asked = bridge.clock.monotonic() + 20.0
     assert bridge.guard(lambda: bridge.clock.monotonic() > asked) == 1
     assert asked < bridge.clock.monotonic() < asked + 0.5
-    assert bridge.notes.drive.powered
+    assert bridge.notes.command.powered
     lock = BusLock(bridge.arm.on_bus.address, "left behind")
-    lock.notes.note(bridge.notes.drive)
+    lock.notes.note(bridge.notes.command)
     lock.release()
     bridge.clock.later(2.0, lambda: setattr(bridge.arm.device, "bus_silent", False))
     OwnedBus(bridge.arm.on_bus, "the next bridge", bridge.log.append, bridge.clock).close()
@@ -162,10 +162,10 @@ def test_a_watchdog_whose_motors_are_silent_hands_the_bus_over_and_the_next_brid
 
 
 def test_the_computer_is_not_suspended_while_the_motors_are_on(bridge: Bridge) -> None:
-    on, bridge.drive = bridge.drive, OFF
-    bridge.at(1.0, lambda: setattr(bridge, "drive", on))
+    on, bridge.command = bridge.command, OFF
+    bridge.at(1.0, lambda: setattr(bridge, "command", on))
     seen: list[tuple[bool, bool]] = []
-    bridge.clock.every(0.1, lambda: seen.append((bridge.drive.powered, bridge.inhibited[-1])))
+    bridge.clock.every(0.1, lambda: seen.append((bridge.command.powered, bridge.inhibited[-1])))
     bridge.at(2.05, bridge.die)
     assert bridge.guard() == 0
     assert seen[0] == (False, False) and seen[15] == (True, True)
@@ -185,7 +185,7 @@ def test_the_inhibiting_program_runs_until_it_is_released() -> None:
 
 @pytest.mark.parametrize("is_frozen", [False, True])
 def test_nothing_is_sent_for_a_bridge_whose_motors_are_off(bridge: Bridge, is_frozen: bool) -> None:
-    bridge.drive = OFF
+    bridge.command = OFF
     if is_frozen:
         bridge.at(0.5, bridge.freeze)
     bridge.at(1.0, bridge.die)
@@ -209,7 +209,7 @@ def test_a_bridge_lives_on_after_the_whole_machine_has_stalled(bridge: Bridge) -
 
     for delay in (0.5, 1.0):
         bridge.at(delay, stall)
-    bridge.at(2.0, lambda: setattr(bridge, "drive", OFF))
+    bridge.at(2.0, lambda: setattr(bridge, "command", OFF))
     bridge.at(2.5, bridge.die)
     assert bridge.guard() == 0
     assert not bridge.killed
@@ -277,8 +277,8 @@ def test_a_frozen_watchdog_is_noticed_and_recovers_and_ends_with_its_bridge(rig)
 
 FAVOURED = """
 import os
-from exo_gravity.hardware.clock import favour
-favour(15)
+from exo_gravity.hardware.clock import raise_priority
+raise_priority(15)
 print(os.getpriority(os.PRIO_PROCESS, 0))
 """
 AUTOGROUP = Path("/proc/self/autogroup")

@@ -26,7 +26,7 @@ from exo_gravity.hardware.motor_bus import MotorBus
 from exo_gravity.lab import processes
 
 from ..support.launched_nodes import CALM, NO_IMU, LaunchedNodes
-from ..support.simulated_device import OFF, drive_of
+from ..support.simulated_device import OFF, command_of
 from ..support.waiting import wait_until
 
 ONE, TWO = "vcan0", "vcan0,vcan0,vcan1,vcan1"
@@ -67,7 +67,7 @@ def heard(bus: can.BusABC) -> list[can.Message]:
 
 def test_a_link_that_is_down_is_a_bus_error_and_the_motors_are_switched_off_once_it_is_up():
     bus = bus_on(ONE)
-    bus.exchange(drive_of(NO_TORQUE), time.monotonic())
+    bus.exchange(command_of(NO_TORQUE), time.monotonic())
     with down("vcan0"):
         for _ in range(3):
             with pytest.raises(BusError, match=r"vcan0.*Network is down"):
@@ -89,7 +89,7 @@ def test_one_of_two_links_that_is_down_is_named_and_the_other_gets_its_commands(
     bus.receive_until(time.monotonic() + 1.0, lambda: bus.samples[2].time > 0.0)
     assert bus.samples[2].time > 0.0
     with down("vcan1"), pytest.raises(BusError, match=r"vcan1.*Network is down"):
-        bus.exchange(drive_of(NO_TORQUE), time.monotonic())
+        bus.exchange(command_of(NO_TORQUE), time.monotonic())
     assert [bytes(frame.data) for frame in heard(listeners[0])].count(ENTER) == 2
     bus.stop()
     for other in listeners:

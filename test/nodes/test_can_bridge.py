@@ -32,7 +32,7 @@ from exo_gravity.core.motors.families import MOTORS
 from exo_gravity.core.motors.joint_motor import UNKNOWN, JointMotor, JointSample, Traffic
 from exo_gravity.core.numbers import NO_TORQUE
 from exo_gravity.core.safety import descent, guidance, machine
-from exo_gravity.core.safety.drive import NO_EFFORTS, Efforts, FaultCode, State
+from exo_gravity.core.safety.command import NO_EFFORTS, Efforts, FaultCode, State
 from exo_gravity.core.safety.lease import LEASE_TIME, Lease
 from exo_gravity.core.safety.limits import Limits
 from exo_gravity.core.safety.machine import SafetyMachine
@@ -129,9 +129,9 @@ def test_a_motor_above_its_rated_torque_and_a_slow_loop_are_named_and_every_key_
     assert expected.items() <= keys_of(reports[-1]).items()
 
 
-def riding(n):
+def stale(n):
     loop = carrying(n)
-    loop.safety.ride.step(1000.0, 0.004, 0.07, False)
+    loop.safety.stale.step(1000.0, 0.004, 0.07, False)
     return loop
 
 
@@ -146,8 +146,8 @@ def riding(n):
             "motor 1 read -15 degC when it was switched on, the others 40 to 40",
             {"temperatures when switched on": "implausible"},
         ),
-        (riding, 15, WARN, "active, riding through: efforts 70 ms old", {"rides": "1"}),
-        (riding, -1, OK, "active", {}),
+        (stale, 15, WARN, "active, still used: efforts 70 ms old", {"rides": "1"}),
+        (stale, -1, OK, "active", {}),
         (lambda _: None, 0, WARN, "", {"state": "inactive", "source": "simulated", "control held by": "nobody"}),
     ],
 )
@@ -182,9 +182,9 @@ def ask(node):
     last: the keys `request` and `answer` after it.
     """
 
-    def ask(service, loop, data=None, zero=0.0, hindrance=""):
+    def ask(service, loop, data=None, zero=0.0, refusal=""):
         motors = [JointMotor(MOTORS["AK60-6"], can_id, zero=zero) for can_id in (1, 2, 3, 4)]
-        services = BridgeServices(node, lambda: loop, motors, lambda: hindrance)
+        services = BridgeServices(node, lambda: loop, motors, lambda: refusal)
         response = finish(services.answer(getattr(services, service), SimpleNamespace(data=data), SimpleNamespace()))
         ask.last = services.last
         return "" if response.success else response.message
@@ -230,8 +230,8 @@ def test_an_operator_enables_disables_and_clears_or_reads_why_not(ask):
 
 def test_the_answer_to_a_request_has_a_word_of_its_own_for_each_reason(ask, monkeypatch):
     loop = standing()
-    assert ask("enable", loop, True, hindrance="leaves") == "leaves" and ask.last == ("enable", "leaving")
-    assert ask("enable", loop, False, hindrance="leaves") == "" and ask.last == ("let_down", "done")
+    assert ask("enable", loop, True, refusal="leaves") == "leaves" and ask.last == ("enable", "leaving")
+    assert ask("enable", loop, False, refusal="leaves") == "" and ask.last == ("let_down", "done")
     monkeypatch.setattr(operation, "CALL_TIMEOUT", 0.0)
     run, (waiting, broken, overtaken) = loop.call, (Future() for _ in range(3))
     broken.set_exception(BusError("unplugged"))

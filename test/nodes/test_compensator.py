@@ -35,7 +35,7 @@ from exo_gravity.core.compensation.compensator import Compensator
 from exo_gravity.core.compensation.settings import COMPENSATOR
 from exo_gravity.core.errors import ParameterError
 from exo_gravity.core.safety import guidance as guided
-from exo_gravity.hardware.network import keep_to_this_machine
+from exo_gravity.hardware.network import restrict_to_localhost
 from exo_gravity.hardware.urdf_arm import UrdfArm
 from exo_gravity.lab.inputs.arms import read_arm
 from exo_gravity.nodes.compensator import arm
@@ -50,7 +50,7 @@ from ..support.chains import random_chain
 from ..support.node_thread import NodeRig
 from ..support.waiting import each_closed, pause, wait_until
 
-keep_to_this_machine()
+restrict_to_localhost()
 NAMES = [f"right_{part}" for part in PARTS]
 POSE = (0.2, 0.9, 0.7, 0.6)  # rad
 STILL = [0.0] * 4

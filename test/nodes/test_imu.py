@@ -18,7 +18,7 @@ from sensor_msgs.msg import Imu
 from exo_gravity.core.errors import ParameterError
 from exo_gravity.core.trunk.params import GROUP
 from exo_gravity.hardware.imu_source import ImuSource
-from exo_gravity.hardware.network import keep_to_this_machine
+from exo_gravity.hardware.network import restrict_to_localhost
 from exo_gravity.hardware.trunk_estimator import ImuSample, TrunkEstimator
 from exo_gravity.nodes.imu import ImuNode
 from exo_gravity.nodes.ros.messages import to_nanoseconds
@@ -28,7 +28,7 @@ from ..support.imu_motion import bowing_and_walking
 from ..support.node_thread import NodeRig
 from ..support.waiting import each_closed
 
-keep_to_this_machine()
+restrict_to_localhost()
 G = 9.80665
 TRUNK_FROM_IMU = Rotation.from_euler("xyz", (math.pi / 2, 0.0, math.pi / 2))  # its x points left, its y up
 MOUNTING = tuple(TRUNK_FROM_IMU.as_quat().tolist())

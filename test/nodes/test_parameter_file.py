@@ -13,13 +13,13 @@ import yaml
 
 from exo_gravity.core.errors import ParameterError
 from exo_gravity.core.params import ROS_PARAMETERS
-from exo_gravity.hardware.network import keep_to_this_machine
+from exo_gravity.hardware.network import restrict_to_localhost
 from exo_gravity.lab.inputs import ros_yaml
 from exo_gravity.nodes.ros.parameters import plain
 
 from ..support import CONFIG
 
-keep_to_this_machine()
+restrict_to_localhost()
 
 WRITTEN = (  # what people write, and what PyYAML and rcl read differently
     "5e-1", "5e3", "1E5", ".5", "5.", "+.5", "-0", "+7", "07", "08", "0x1F", "-0x10", "0x1p-2", "0o17", "1_000",

@@ -16,7 +16,7 @@ from visualization_msgs.msg import Marker, MarkerArray
 from exo_gravity.core.compensation.settings import COMPENSATOR
 from exo_gravity.core.params import table_for, values_of
 from exo_gravity.core.safety.limits import CAN_BRIDGE
-from exo_gravity.hardware.network import keep_to_this_machine
+from exo_gravity.hardware.network import restrict_to_localhost
 from exo_gravity.lab.inputs.parameter_file import load
 from exo_gravity.lab.view import ROOT
 from exo_gravity.nodes.robot_model import RobotModel
@@ -26,7 +26,7 @@ from exo_gravity.tools.urdf import urdf_of
 from ..support import CONFIG, PARTS
 from ..support.node_thread import NodeRig
 
-keep_to_this_machine()
+restrict_to_localhost()
 READINGS = {"left": (0.1, 0.2, 0.3, 0.4), "right": (-0.1, 0.5, 0.6, 0.7)}
 EFFORT = (0.0, 1.5, 1.2, 0.2)
 BOTH = CONFIG / "sim_both.yaml"

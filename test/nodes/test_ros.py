@@ -49,7 +49,7 @@ from exo_gravity.core.compensation.settings import COMPENSATOR
 from exo_gravity.core.errors import ParameterError
 from exo_gravity.core.params import Param
 from exo_gravity.hardware import network
-from exo_gravity.hardware.network import keep_to_this_machine, open_to_others
+from exo_gravity.hardware.network import open_to_others, restrict_to_localhost
 from exo_gravity.lab.inputs.parameter_file import load
 from exo_gravity.nodes import pose_prompt
 from exo_gravity.nodes.others import NodeParameters
@@ -65,7 +65,7 @@ from ..support import CONFIG
 from ..support.node_thread import NodeThread, own_node
 from ..support.waiting import pause, wait_until
 
-keep_to_this_machine()
+restrict_to_localhost()
 NUMBERS = itertools.count(1)
 QUEUE = QoSProfile(depth=8)
 
@@ -365,7 +365,7 @@ def test_a_node_communicates_on_this_machine_only_unless_a_person_widens_it_and_
 ):
     for name, value in settings.items():
         environment(name, value)
-    keep_to_this_machine()
+    restrict_to_localhost()
     assert (os.environ[ROS_RANGE], os.environ.get(PROFILES), open_to_others()) == (reach, profile, named)
 
 

@@ -21,7 +21,7 @@ import exo_gravity.panel
 from exo_gravity.core import vocabulary
 from exo_gravity.core.compensation.guidance import CAUSE_TIME
 from exo_gravity.core.errors import ParameterError
-from exo_gravity.core.safety.drive import FaultCode, State
+from exo_gravity.core.safety.command import FaultCode, State
 from exo_gravity.core.safety.lease import LEASE_TIME
 from exo_gravity.lab import processes
 from exo_gravity.lab import vocabulary as beside

@@ -18,7 +18,7 @@ from exo_gravity.core.arm.tilt import Tilt
 from exo_gravity.core.motors.ak import MIT
 from exo_gravity.core.motors.joint_motor import JointMotor, motors_of
 from exo_gravity.core.numbers import NO_TORQUE, Vector
-from exo_gravity.core.safety.drive import State
+from exo_gravity.core.safety.command import State
 from exo_gravity.core.safety.limits import CAN_BRIDGE, Limits, limits_of
 from exo_gravity.core.safety.machine import SafetyMachine
 from exo_gravity.lab.calibration.live import LiveTour

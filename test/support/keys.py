@@ -6,7 +6,7 @@ from collections.abc import Iterable, Iterator, Mapping
 from functools import lru_cache
 from typing import NamedTuple
 
-from exo_gravity.core.safety.drive import FaultCode
+from exo_gravity.core.safety.command import FaultCode
 from exo_gravity.core.vocabulary import NONE, TEXT, UNKNOWN
 
 from . import ROOT

@@ -17,14 +17,14 @@ from sensor_msgs.msg import JointState
 from std_msgs.msg import String
 from std_srvs.srv import SetBool, Trigger
 
-from exo_gravity.hardware.network import keep_to_this_machine
+from exo_gravity.hardware.network import restrict_to_localhost
 
 from . import CONFIG
 from .keys import broken, documented
 from .node_thread import NodeThread
 from .waiting import wait_until
 
-keep_to_this_machine()
+restrict_to_localhost()
 
 HOME = [0.0, 0.05, 0.05, 0.05]  # rad, hanging and within the limits
 HELP_TIME = 20.0  # s for which config/home.yaml holds the arm: a joint with little friction swings out of its limits

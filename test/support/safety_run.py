@@ -9,7 +9,7 @@ from typing import Any
 
 from exo_gravity.core.motors.joint_motor import UNKNOWN, JointSample
 from exo_gravity.core.numbers import NO_TORQUE
-from exo_gravity.core.safety.drive import Efforts, Send, State
+from exo_gravity.core.safety.command import Efforts, Send, State
 from exo_gravity.core.safety.limits import Limits
 from exo_gravity.core.safety.machine import SafetyMachine
 
@@ -38,7 +38,7 @@ class SafetyRun:
 
     changes: of each joint's reading. silent: the joints whose motors do not reply. off: those whose motors have been
     switched off behind the machine's back. effort: Nm, with `effort_age` in s; damped: as while the load changes; held:
-    as of a late tilt. drive: the machine's last output. applied: (4,) Nm, what the motors truly apply; a silent motor
+    as of a late tilt. command: the machine's last output. applied: (4,) Nm, what the motors truly apply; a silent motor
     keeps its torque. steps: its largest step per cycle. while_hanging: Nm, asked for in place of `effort` while the
     start is checked. period: s of a cycle.
     """
@@ -54,7 +54,7 @@ class SafetyRun:
         self.damped = self.held = False
         self.joints = [UNKNOWN] * 4
         self.silent, self.off = set[int](), set[int]()
-        self.drive = OFF
+        self.command = OFF
         self.applied = [0.0] * 4
         self.steps: list[float] = []
 
@@ -64,7 +64,7 @@ class SafetyRun:
             self.now += self.period
             for i, change in enumerate(self.changes):
                 if i not in self.silent:
-                    damped = self.applied[i] - self.drive.damping[i] * change.get("velocity", 0.0)
+                    damped = self.applied[i] - self.command.damping[i] * change.get("velocity", 0.0)
                     most = LIMITS.max_effort[i]
                     torque = 0.0 if i in self.off else max(-most, min(most, damped))
                     self.joints[i] = reading(**{"time": self.now - 0.001, "effort": torque, **change})
@@ -72,10 +72,10 @@ class SafetyRun:
             hangs = self.effort is not None and self.machine.state is State.CHECKING
             effort = self.while_hanging if hangs else self.effort
             efforts = Efforts(effort, self.now - self.effort_age, self.damped, self.held)
-            self.drive = self.machine.step(self.now, tuple(self.joints), efforts)
+            self.command = self.machine.step(self.now, tuple(self.joints), efforts)
             for i in {0, 1, 2, 3} - self.silent:
-                self.applied[i] = 0.0 if i in self.off else self.drive.effort[i]
-            self.off -= {i for i in self.off if self.drive.send[i] is Send.ENTER}
+                self.applied[i] = 0.0 if i in self.off else self.command.effort[i]
+            self.off -= {i for i in self.off if self.command.send[i] is Send.ENTER}
             own = {0, 1, 2, 3} - self.off
             self.steps.append(max((abs(self.applied[i] - before[i]) for i in own), default=0.0))
         return self

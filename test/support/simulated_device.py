@@ -11,11 +11,11 @@ from exo_gravity.core.motors.families import MOTORS
 from exo_gravity.core.motors.frames import WireFormat, pack_command
 from exo_gravity.core.motors.joint_motor import JointMotor
 from exo_gravity.core.numbers import NO_TORQUE
-from exo_gravity.core.safety.drive import Drive, Send
+from exo_gravity.core.safety.command import Command, Send
 from exo_gravity.sim import ArmConfig, Firmware, SimulatedArm, SimulatedDevice, SimulatedMotor
 
 SPECS = [MOTORS[name] for name in ("AK60-6", "AK80-9", "AK60-6", "AK60-6")]
-OFF = Drive.off(len(SPECS))
+OFF = Command.off(len(SPECS))
 RAISED = (0.3, 0.8, 0.7, 0.6)  # rad
 
 
@@ -37,14 +37,14 @@ def joints_of(formats: Sequence[WireFormat], ids: Sequence[int] = (1, 2, 3, 4)) 
     )
 
 
-def drive_of(effort: Sequence[float], damping: Sequence[float] = NO_TORQUE) -> Drive:
-    """Return the drive of motors that are on, all of them for sure. effort: (4,) Nm, damping: (4,) Nm s/rad."""
-    return Drive(tuple(effort), tuple(damping), (Send.COMMAND,) * len(SPECS), True)
+def command_of(effort: Sequence[float], damping: Sequence[float] = NO_TORQUE) -> Command:
+    """Return the command of motors that are on, all of them for sure. effort: (4,) Nm, damping: (4,) Nm s/rad."""
+    return Command(tuple(effort), tuple(damping), (Send.COMMAND,) * len(SPECS), True)
 
 
-def sending(send: Send, drive: Drive = OFF) -> Drive:
-    """Return `drive` with the same frame for all motors, which may be on."""
-    return drive._replace(send=(send,) * len(drive.send), powered=True)
+def sending(send: Send, command: Command = OFF) -> Command:
+    """Return `command` with the same frame for all motors, which may be on."""
+    return command._replace(send=(send,) * len(command.send), powered=True)
 
 
 def command(joint: int, torque: float = 0.0, kd: float = 0.0) -> bytes:

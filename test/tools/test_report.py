@@ -26,7 +26,7 @@ from scipy import stats
 from exo_gravity.core import ArmModel, Tilt, gravity_torque
 from exo_gravity.core.arm.tilt import gravity_in_trunk
 from exo_gravity.core.arm.wearer import Wearer
-from exo_gravity.core.safety.drive import FaultCode
+from exo_gravity.core.safety.command import FaultCode
 from exo_gravity.core.vocabulary import Source
 from exo_gravity.lab.bag.content import Event, NodeStatus
 from exo_gravity.lab.bag.reader import read_bag

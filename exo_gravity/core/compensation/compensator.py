@@ -22,7 +22,7 @@ from exo_gravity.core.compensation.guidance import DROP, PAUSE, TOUCH, DropWatch
 from exo_gravity.core.compensation.settings import Settings
 from exo_gravity.core.compensation.support import SupportRequest
 from exo_gravity.core.compensation.terms.terms import Terms, TermsInForce
-from exo_gravity.core.numbers import Torque, limited
+from exo_gravity.core.numbers import Torque, rate_limited
 from exo_gravity.core.params import JOINT_NAMES
 from exo_gravity.core.trunk.inputs import TILT, FeltMotion, TiltInput
 from exo_gravity.core.vocabulary import NO_REASON, Reason, Withdrawal
@@ -176,7 +176,7 @@ class Compensator:
         # Over 1 rad gravity's torque changes by its amplitude: a lower limit would make that of a moving arm false.
         turn, step = sum(map(abs, velocity or ())), min(dt, LONGEST_STEP)
         self._effort = tuple([
-            limited(new, last, step * (s.max_effort_rate + turn * most))
+            rate_limited(new, last, step * (s.max_effort_rate + turn * most))
             for new, last, most in zip(torque, self._effort, s.max_effort, strict=True)
         ])  # fmt: skip
         is_due = s.mode == "zero_g" and now - self._touch_watch.time >= TOUCH.period

@@ -102,7 +102,7 @@ class Boards:
             )
         self._heard[joint] = now, f"motor {motor.can_id} {what}"
 
-    def hindrance(self, now: float, rate: float) -> str:
+    def setup_error(self, now: float, rate: float) -> str:
         """Return which board is not set up as it must be for a start, and how, at `now` s; '' if none shows it.
 
         rate: Hz of the control loop, each cycle of which waits for a status frame of a V3 board.

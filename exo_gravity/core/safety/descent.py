@@ -32,7 +32,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 from exo_gravity.core.motors.joint_motor import JointSample
-from exo_gravity.core.numbers import limited
+from exo_gravity.core.numbers import rate_limited
 from exo_gravity.core.safety.limits import DAMPING, DAMPING_RATE, MAX_EFFORT_RATE
 from exo_gravity.core.safety.watch import excess_torque, expected_torque
 
@@ -138,7 +138,7 @@ class JointDescent:
 
     def _approach(self, effort: float, rate: float, dt: float) -> None:
         """Bring the torque nearer to `effort` (Nm), by at most `rate` (Nm/s)."""
-        self.effort = limited(effort, self.effort, min(MAX_EFFORT_RATE, rate) * dt)
+        self.effort = rate_limited(effort, self.effort, min(MAX_EFFORT_RATE, rate) * dt)
 
     def _raise_damping(self, dt: float, share: float = 1.0) -> None:
         """Raise the damping by this share of the full rate."""

@@ -1,5 +1,5 @@
 # Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
-"""Whether the efforts can be used: gravity accounts for their torque, and they are new enough (`RideThrough`).
+"""Whether the efforts can be used: gravity accounts for their torque, and they are new enough (`StaleEfforts`).
 
 `MotionMonitor` is an independent eye on the compensator: it finds torque that gravity cannot account for, and the speed
 that it can cause.
@@ -26,7 +26,7 @@ from itertools import accumulate
 from exo_gravity.core.arm.rotation import ZERO, Floats3, Quaternion, cross, dot, plus, product, rotated
 from exo_gravity.core.arm.tilt import SIDES, Tilt
 from exo_gravity.core.motors.joint_motor import JointSample
-from exo_gravity.core.safety.drive import Fault, FaultCode
+from exo_gravity.core.safety.command import Fault, FaultCode
 from exo_gravity.core.safety.limits import Limits
 
 GRAVITY = 9.81  # m/s^2
@@ -54,15 +54,15 @@ class MotionLimits:
 
 
 @dataclass(frozen=True)
-class Ride:
-    """For how long in s late efforts are still applied."""
+class StaleLimits:
+    """For how long in s stale efforts are still applied."""
 
     longest_age: float = 0.18  #: of efforts; less than the gap after which the compensator ramps in from zero
     longest: float = 0.13  #: at a time
-    recovery: float = 0.1  #: of riding that each s with sound efforts makes good
+    recovery: float = 0.1  #: of that time that each s with sound efforts makes good
 
 
-MOTION, RIDE = MotionLimits(), Ride()
+MOTION, STALE = MotionLimits(), StaleLimits()
 
 
 class MotionMonitor:
@@ -171,27 +171,27 @@ class MotionMonitor:
         return tilt.gravity_in_trunk if self._limits.axes else tilt.direction
 
 
-class RideThrough:
+class StaleEfforts:
     """For a moment the last efforts, and damping that rises, hold the arm as well as new efforts would.
 
     A compensator that is late on a busy computer, or whose tilt is late, needs no descent. While efforts are older than
     `timeout` (s), or computed from a late tilt, the motors apply the newest ones, and their damping rises as in a
-    descent; once the efforts are sound again it falls. The ride ends in a fault once it is too long, efforts are too
-    old, or they have been late too often: ordinary computers are late for less than `RIDE.recovery` of the time. Up to
-    `RIDE.longest_age` an arm that moves on at 1 rad/s makes the torque wrong by 18 % of gravity's largest.
+    descent; once the efforts are sound again it falls. It ends in a fault once they are stale for too long, too
+    old, or have been so too often: ordinary computers are late for less than `STALE.recovery` of the time. Up to
+    `STALE.longest_age` an arm that moves on at 1 rad/s makes the torque wrong by 18 % of gravity's largest.
 
-    is_riding: whether efforts are late and still used.
-    rides: how often that began.
-    why: of the last ride.
-    ended: s, when it was last going on.
+    are_used: whether the efforts are stale and still used.
+    count: how often that began.
+    why: of the last time.
+    seen: s, when they were last so.
     """
 
     def __init__(self, timeout: float) -> None:
-        self.is_riding = False
-        self.rides = 0
-        self.why, self.ended = "", -math.inf
+        self.are_used = False
+        self.count = 0
+        self.why, self.seen = "", -math.inf
         self._timeout = timeout
-        self._left = RIDE.longest
+        self._left = STALE.longest
 
     def step(self, now: float, dt: float, age: float, held: bool) -> Fault | None:
         """Take the age of the newest efforts; return a fault if they can no longer be used.
@@ -202,15 +202,15 @@ class RideThrough:
         held: whether they are computed from a late tilt.
         """
         if age <= self._timeout and not held:
-            self.is_riding = False
-            self._left = min(RIDE.longest, self._left + RIDE.recovery * dt)
+            self.are_used = False
+            self._left = min(STALE.longest, self._left + STALE.recovery * dt)
             return None
-        self.rides += not self.is_riding
-        self.is_riding, self.ended = True, now
+        self.count += not self.are_used
+        self.are_used, self.seen = True, now
         self._left = max(0.0, self._left - dt)
         self.why = f"efforts {1000.0 * age:.0f} ms old" + (", of a tilt that is late" if held else "")
-        if self._left > 0.0 and age <= RIDE.longest_age:
+        if self._left > 0.0 and age <= STALE.longest_age:
             return None
-        self.is_riding = False
-        limit = f"{1000.0 * self._timeout:.0f} ms, or {1000.0 * RIDE.longest:.0f} ms more for a moment"
+        self.are_used = False
+        limit = f"{1000.0 * self._timeout:.0f} ms, or {1000.0 * STALE.longest:.0f} ms more for a moment"
         return Fault(FaultCode.COMMAND_STALE, f"{self.why}: must be less than {limit}")

@@ -1,7 +1,7 @@
 # Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
 """The limits of a worn arm, and which motor readings are plausible.
 
-watch.py finds readings that are a fault. shape.py keeps every drive within the limits.
+watch.py finds readings that are a fault. shape.py keeps every command within the limits.
 docs/safety_case.md compares the defaults with those of other systems.
 """
 

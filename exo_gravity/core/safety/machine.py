@@ -1,7 +1,7 @@
 # Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
 """The state machine between the requested efforts and the motors. Pure: time is an argument.
 
-`drive.TRANSITIONS` has every transition, `watch.NEXT` those of a single motor.
+`command.TRANSITIONS` has every transition, `watch.NEXT` those of a single motor.
 
 - CHECKING waits for the start gate (start.py), at most `enable_timeout`. If zeros are not trusted, the arm must hang, a
   person must confirm it unless `start_pose` says that they have, and little torque may be asked for.
@@ -14,7 +14,7 @@
   again, however late, its joint is lowered from the torque that it then applies.
 - FAULT latches the code and reason of the first fault.
 
-A compensator that is late for a moment is waited for (`RideThrough`): the last torque stays, and damping rises.
+A compensator that is late for a moment is waited for (`StaleEfforts`): the last torque stays, and damping rises.
 
 Zeros and signs are trusted once they were checked, for as long as the angles are continuous (watch.py). So long
 `resume` carries an arm on from any pose after a fault that leaves nothing to repair.
@@ -26,12 +26,11 @@ from collections.abc import Iterable, Sequence
 
 from exo_gravity.core.errors import ParameterError
 from exo_gravity.core.motors.joint_motor import JointMotor, JointSample
-from exo_gravity.core.numbers import limited
-from exo_gravity.core.safety.descent import ArmDescent
-from exo_gravity.core.safety.drive import (
+from exo_gravity.core.numbers import rate_limited
+from exo_gravity.core.safety.command import (
     CARRYING,
     TRANSITIONS,
-    Drive,
+    Command,
     Efforts,
     Fault,
     FaultCode,
@@ -39,7 +38,8 @@ from exo_gravity.core.safety.drive import (
     State,
     StateEvent,
 )
-from exo_gravity.core.safety.explain import MotionMonitor, RideThrough
+from exo_gravity.core.safety.descent import ArmDescent
+from exo_gravity.core.safety.explain import MotionMonitor, StaleEfforts
 from exo_gravity.core.safety.guidance import GuidedMotion
 from exo_gravity.core.safety.limits import CONFIRM, DAMPING, DAMPING_RATE, MAX_EFFORT_RATE, Limits
 from exo_gravity.core.safety.shape import STILLNESS, Shaper
@@ -69,7 +69,7 @@ class SafetyMachine:
 
     state: the State. fault: the latched Fault or None. waiting_for: what CHECKING or PROVING waits for. refusal: why
     the last enable was refused without a fault. acted: for each limit that has acted, by name, the last time. watch:
-    what is known of each motor. ride: through late efforts. motion: judges the efforts by gravity alone. pose: the
+    what is known of each motor. stale: efforts that are late. motion: judges the efforts by gravity alone. pose: the
     question to the operator whether the arm hangs as it is drawn. signs: the proof of signs.
     """
 
@@ -79,17 +79,17 @@ class SafetyMachine:
         self.fault: Fault | None = None
         self.waiting_for = self.refusal = NO_REASON
         self.acted: dict[str, float] = {}
-        self.ride = RideThrough(limits.command_timeout)
-        self._ride_while_checking = RideThrough(limits.command_timeout)
+        self.stale = StaleEfforts(limits.command_timeout)
+        self._stale_while_checking = StaleEfforts(limits.command_timeout)
         self._period = period
         count = len(limits.joint_names)
         self._none, self._commands = (0.0,) * count, (Send.COMMAND,) * count
-        #: the last hand on every drive
+        #: the last hand on every command
         self.shaper = Shaper(limits, [motor.peak_damping for motor in motors] or [math.inf] * count)
         self.watch = ArmWatch(limits, period, motors)
         self._since = self._calm_since = 0.0
         self._now, self._dt = -math.inf, 0.0  # of the present cycle
-        self._sent = self._off = Drive.off(count)  # last sent to the motors
+        self._sent = self._off = Command.off(count)  # last sent to the motors
         self._descent = ArmDescent(0.0, self._none, self._none, self._none)
         self._rise = GuidedMotion(count)  # of the torque, where it begins
         self.pose = PoseQuestion(limits.joint_names)
@@ -97,12 +97,12 @@ class SafetyMachine:
         self.signs = SignCheck(limits.joint_names, limits.max_effort)
         self._left: Sequence[float] = ()  # Nm, what another process left the motors with
         self._attempts = 0  # to switch a motor on again that shows no torque while it is pushed
-        #: Whether the last drive did not leave for each motor (n,), set from outside: that motor holds what it had.
+        #: Whether the last command did not leave for each motor (n,), set from outside: that motor holds what it had.
         self.unsent: Sequence[bool] = (False,) * count
         #: Whether each motor (n,) was sent nothing in the last cycle on purpose, set from outside: it owes no reply.
         self.held_back: Sequence[bool] = (False,) * count
         #: What else CHECKING waits for, set from outside.
-        self.hindrance = NO_REASON
+        self.setup_error = NO_REASON
 
     @property
     def is_unreached(self) -> bool:
@@ -177,7 +177,7 @@ class SafetyMachine:
 
     def take_over(self, effort: Sequence[float], damping: Sequence[float], now: float) -> None:
         """Let down an arm whose controller has died while its motors applied `effort` (n,) Nm and `damping` (n,)."""
-        self._sent, self._left = Drive(tuple(effort), tuple(damping), self._commands, True), effort
+        self._sent, self._left = Command(tuple(effort), tuple(damping), self._commands, True), effort
         self.watch.change_power(PowerChange.TAKEN_OVER)
         self.state = State.ACTIVE
         self._on(StateEvent.DISABLE, now)
@@ -187,7 +187,7 @@ class SafetyMachine:
         self._descent = ArmDescent(now, self._none, (DAMPING,) * len(self._none), self.limits.max_effort)
         self.watch.change_power(PowerChange.PROBED)
 
-    def step(self, now: float, joints: Sequence[JointSample], efforts: Efforts) -> Drive:
+    def step(self, now: float, joints: Sequence[JointSample], efforts: Efforts) -> Command:
         """Return what the motors receive in the cycle at `now` s.
 
         joints: the newest sample of each joint, shoulder to elbow.
@@ -210,7 +210,7 @@ class SafetyMachine:
             self._latch(fault, self._now)
         if self.state is State.PROVING:
             self._prove(efforts.effort or self._none)
-        self._sent = self._drive(effort or self._none, efforts.damped)
+        self._sent = self._command(effort or self._none, efforts.damped)
         return self._sent
 
     def _share_supply(self, left: Sequence[float]) -> None:
@@ -241,9 +241,9 @@ class SafetyMachine:
             return Fault(FaultCode.LOAD_MISSING, why)
         if efforts.effort is None:
             return Fault(FaultCode.COMMAND_WITHDRAWN, "the compensator withdrew its efforts; see its diagnostics")
-        return self.ride.step(self._now, self._dt, self._now - efforts.answered, efforts.held)
+        return self.stale.step(self._now, self._dt, self._now - efforts.answered, efforts.held)
 
-    def _drive(self, effort: Sequence[float], damped: bool) -> Drive:
+    def _command(self, effort: Sequence[float], damped: bool) -> Command:
         if self.state in CARRIED:
             try:
                 return self._carry(effort, damped)
@@ -253,19 +253,19 @@ class SafetyMachine:
             return self._push()
         return self._descend() if self.state is State.LETTING_DOWN else self._stand()
 
-    def _powered(self, effort: Iterable[float], damping: Iterable[float], send: Iterable[Send]) -> Drive:
-        """Return a drive of motors that may be on, within the barrier."""
+    def _powered(self, effort: Iterable[float], damping: Iterable[float], send: Iterable[Send]) -> Command:
+        """Return a command of motors that may be on, within the barrier."""
         watch, torque = self.watch, tuple(effort)
         bounded = self.shaper.damping(self._dt, watch.samples, watch.silent, torque, tuple(damping), watch.is_late)
-        return Drive(torque, bounded, tuple(send), any(motor.may_be_on for motor in watch.joints))
+        return Command(torque, bounded, tuple(send), any(motor.may_be_on for motor in watch.joints))
 
     def _check(self, efforts: Efforts) -> None:
         """Continue to PROVING once all has been well for a while, or trip on a fault that refuses the start.
 
         Efforts may be late as they may while the arm is carried, but not in the cycle in which the checks end.
         """
-        watch, limits, effort, ride = self.watch, self.limits, efforts.effort, self._ride_while_checking
-        are_late = ride.step(self._now, self._dt, self._now - efforts.answered, efforts.held)
+        watch, limits, effort, stale = self.watch, self.limits, efforts.effort, self._stale_while_checking
+        are_late = stale.step(self._now, self._dt, self._now - efforts.answered, efforts.held)
         missing = missing_for_a_start(limits, watch.samples, watch.fault, watch.trusted)
         if isinstance(missing, Fault):
             if not any(motor.is_clearing for motor in watch.joints):
@@ -288,9 +288,9 @@ class SafetyMachine:
         if asks:
             missing = self.pose.missing(self._now, watch.samples, missing)
         # It passes, too, while the bridge cannot switch motors on, and while the operator looks at the arm.
-        self.waiting_for = self.hindrance or missing or Reason(Wait.CALM, f"{START_GATE.calm:g} s without a fault")
-        is_calm = not (self.hindrance or missing) and self._now - self._calm_since >= START_GATE.calm
-        if is_calm and effort is not None and not ride.is_riding:
+        self.waiting_for = self.setup_error or missing or Reason(Wait.CALM, f"{START_GATE.calm:g} s without a fault")
+        is_calm = not (self.setup_error or missing) and self._now - self._calm_since >= START_GATE.calm
+        if is_calm and effort is not None and not stale.are_used:
             fault = None if watch.trusted else torque_while_hanging(limits, effort)
             if fault:
                 self._latch(fault, self._now)
@@ -326,8 +326,8 @@ class SafetyMachine:
             self._rise.begin((1.0,) * len(self._none))
             self._on(StateEvent.PROVEN)
 
-    def _push(self) -> Drive:
-        """Return a drive that switches the motors on one by one, then pushes them gently.
+    def _push(self) -> Command:
+        """Return a command that switches the motors on one by one, then pushes them gently.
 
         A joint is damped only if its signs are trusted, or have just been proven.
         """
@@ -343,10 +343,10 @@ class SafetyMachine:
         boards = zip(again, self.watch.replies, strict=True)
         send = [Send.ENTER if is_missing and replies else Send.COMMAND for is_missing, replies in boards]
         rise = DAMPING_RATE * self._dt
-        drive = self._powered(pushed, [min(DAMPING, last + rise) for last in self._sent.damping], send)
-        return drive._replace(damping=tuple(map(operator.mul, damped, drive.damping)))
+        command = self._powered(pushed, [min(DAMPING, last + rise) for last in self._sent.damping], send)
+        return command._replace(damping=tuple(map(operator.mul, damped, command.damping)))
 
-    def _carry(self, effort: Sequence[float], damped: bool) -> Drive:
+    def _carry(self, effort: Sequence[float], damped: bool) -> Command:
         joints = self.watch.samples
         if self.state is State.RAMPING_IN:
             self._rise.step(self._dt, [joint.velocity for joint in joints], self._none, effort)
@@ -354,13 +354,13 @@ class SafetyMachine:
                 self._on(StateEvent.RAMPED)
         is_guided = damped or self.state is State.RAMPING_IN
         share = [1.0 - left for left in self._rise.shares]
-        late = DAMPING if self.ride.is_riding else 0.0
+        late = DAMPING if self.stale.are_used else 0.0
         torque, damping = self.shaper.shape(self._dt, joints, effort, share, self._sent.effort, is_guided, late)
         self.acted.update(dict.fromkeys(self.shaper.acted, self._now))
         return self._powered(torque, damping, self._commands)
 
-    def _descend(self) -> Drive:
-        """Return a drive that lowers the arm, or stands once it is down."""
+    def _descend(self) -> Command:
+        """Return a command that lowers the arm, or stands once it is down."""
         watch, descent, sent = self.watch, self._descent, self._sent
         descent.step(self._now, self._dt, watch.samples, watch.silent, self.unsent)
         self._switch_quiet_off()
@@ -384,7 +384,7 @@ class SafetyMachine:
             watch.reset_delivery()
         return self._powered(*descent.applied, send)
 
-    def _stand(self) -> Drive:
+    def _stand(self) -> Command:
         """Return what the motors receive while the arm is off: nothing, unless one of them may be on."""
         self._switch_quiet_off()
         if any(motor.power is Power.ON for motor in self.watch.joints):
@@ -393,7 +393,7 @@ class SafetyMachine:
             self._on(StateEvent.FOUND_ON)
             return self._descend()
         if any(motor.power is Power.ENTERING for motor in self.watch.joints):  # the proof has ended
-            pushed = [limited(0.0, push, MAX_EFFORT_RATE * self._dt) for push in self._sent.effort]
+            pushed = [rate_limited(0.0, push, MAX_EFFORT_RATE * self._dt) for push in self._sent.effort]
             if any(pushed):
                 return self._powered(pushed, self._none, self._commands)
             self.watch.change_power(PowerChange.SWITCH_OFF)

@@ -1,12 +1,12 @@
 # Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
-"""The last hand on every drive: no torque that is asked for, whatever asks for it, throws an arm.
+"""The last hand on every command: no torque that is asked for, whatever asks for it, throws an arm.
 
 `shape` limits the torque of an arm that is carried, in this order: soft wall before a joint limit, clamp to the
 permitted torque (derated when hot), rate limit. Its damping is the largest that any cause asks for. What a guided
 motion, late efforts, and torque that a moving joint does not get ask for rises and falls slowly; what the soft wall
 asks for counts at once.
 
-`damping` then bounds each drive that leaves the safety machine, whether the arm is carried or let down. With tau the
+`damping` then bounds each command that leaves the safety machine, whether the arm is carried or let down. With tau the
 feed-forward of a joint, v > 0 its speed along tau, V = `driven_speed` and F = V + BARRIER.span, the motor gets at least
 
     kd = |tau| / F * min(1, max(0, (v - V) / (F - V)))
@@ -45,7 +45,7 @@ from dataclasses import dataclass
 
 from exo_gravity.core.errors import ParameterError
 from exo_gravity.core.motors.joint_motor import JointSample
-from exo_gravity.core.numbers import limited
+from exo_gravity.core.numbers import rate_limited
 from exo_gravity.core.safety.guidance import guide_damping
 from exo_gravity.core.safety.limits import DAMPING, DAMPING_RATE, HEAT, MAX_EFFORT_RATE, WALL, Limits
 
@@ -138,12 +138,12 @@ class JointShaper:
         permitted = limit * (0.5 + 0.5 * max(0.0, min(1.0, colder / HEAT.span)))
         wanted = share * (effort + spring)
         clamped = max(-permitted, min(permitted, wanted))
-        given = limited(clamped, before, MAX_EFFORT_RATE * dt)
+        given = rate_limited(clamped, before, MAX_EFFORT_RATE * dt)
         # The compensator may have clamped it already: all that is permitted counts as clamped.
         missing = given if abs(given) >= permitted else wanted - given
         withheld = DAMPING if missing * sample.velocity < 0.0 else 0.0
         guided = guide_damping(sample.velocity) if is_guided else 0.0
-        self._slowly = limited(max(guided, late, withheld), self._slowly, DAMPING_RATE * dt)
+        self._slowly = rate_limited(max(guided, late, withheld), self._slowly, DAMPING_RATE * dt)
         limiting = {
             "soft wall": wall > 0.0,
             "derating": permitted < limit,
@@ -177,7 +177,7 @@ class JointShaper:
             self._held = full
         elif self._still_for >= STILLNESS.time:
             heavy = max(0.0, min(1.0, abs(effort) / STILLNESS.least - 1.0))
-            self._held = limited(heavy * full, self._held, DAMPING_RATE * dt)
+            self._held = rate_limited(heavy * full, self._held, DAMPING_RATE * dt)
         elif not self._still_for:
             self._held *= max(0.0, 1.0 - dt / STILLNESS.release)
         return self._held
@@ -195,7 +195,7 @@ class JointShaper:
     def bound(
         self, dt: float, sample: JointSample, is_silent: bool, effort: float, damping: float, is_late: bool
     ) -> float:
-        """Return the damping in Nm s/rad of the joint's part of a drive; see `Shaper.damping`."""
+        """Return the damping in Nm s/rad of the joint's part of a command; see `Shaper.damping`."""
         first, velocity = self._limits.driven_speed, sample.velocity if math.isfinite(sample.velocity) else 0.0
         change = velocity - self._slow  # over the lead, or over a cycle that is longer
         self._slow += min(1.0, dt / BARRIER.lead) * change
@@ -220,7 +220,7 @@ class JointShaper:
 
 
 class Shaper:
-    """The bounds of one arm's drives.
+    """The bounds of one arm's commands.
 
     peak_damping: the most that each motor can apply, (n,) Nm s/rad.
 
@@ -248,7 +248,7 @@ class Shaper:
         dt: s since the last call. samples: the newest readings (n,).
         effort: what is asked for, (n,) Nm.
         share: 0..1, the factor (n,) on effort and soft wall where torque begins.
-        before: the torque of the last drive, (n,) Nm.
+        before: the torque of the last command, (n,) Nm.
         is_guided: whether the torque is guided.
         late: the damping that late efforts ask for, Nm s/rad.
 
@@ -274,7 +274,7 @@ class Shaper:
         damping: Sequence[float],
         is_late: bool,
     ) -> tuple[float, ...]:
-        """Return the damping (n,) in Nm s/rad of a drive that is to apply `effort` (n,) Nm.
+        """Return the damping (n,) in Nm s/rad of a command that is to apply `effort` (n,) Nm.
 
         dt: s since the last call. samples: the newest readings (n,).
         silent: which motors (n,) do not reply: their speed is not known, so that it bounds nothing.

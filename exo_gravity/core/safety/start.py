@@ -11,8 +11,8 @@ from typing import NamedTuple
 import numpy as np
 
 from exo_gravity.core.motors.joint_motor import JointSample
-from exo_gravity.core.numbers import limited
-from exo_gravity.core.safety.drive import Fault, FaultCode, Send
+from exo_gravity.core.numbers import rate_limited
+from exo_gravity.core.safety.command import Fault, FaultCode, Send
 from exo_gravity.core.safety.limits import MAX_EFFORT_RATE, Limits
 from exo_gravity.core.vocabulary import NO_REASON, Reason, Wait
 
@@ -297,7 +297,7 @@ class SwitchOnCheck:
         self._pushes = pushes
         for i, torque in enumerate(self._torque):
             target = 0.0 if all(self._is_on) else -torque if pushes % 2 else torque
-            self.effort[i] = limited(target, self.effort[i], MAX_EFFORT_RATE * dt)
+            self.effort[i] = rate_limited(target, self.effort[i], MAX_EFFORT_RATE * dt)
         self.done = all(self._is_on) and not any(self.effort)
         return None
 
@@ -428,7 +428,7 @@ class SignCheck:
 
     def _approach(self, i: int, effort: float, rate: float) -> None:
         """Bring the push on joint `i` nearer to `effort` (Nm), by at most `rate` (Nm/s)."""
-        self.effort[i] = limited(effort, self.effort[i], rate * self._dt)
+        self.effort[i] = rate_limited(effort, self.effort[i], rate * self._dt)
 
     def _fault(self, i: int, reason: str, code: FaultCode = FaultCode.SIGN_UNPROVEN) -> Fault:
         return Fault.of_joint(code, self._names[i], reason)

@@ -49,7 +49,7 @@ from dataclasses import dataclass
 from enum import Enum
 
 from exo_gravity.core.motors.joint_motor import UNKNOWN, JointMotor, JointSample
-from exo_gravity.core.safety.drive import Fault, FaultCode, Send
+from exo_gravity.core.safety.command import Fault, FaultCode, Send
 from exo_gravity.core.safety.limits import HEAT, READING, Limits
 
 

@@ -21,7 +21,7 @@ import numpy as np
 from exo_gravity.core.arm.interface import STANDARD_GRAVITY
 from exo_gravity.core.arm.rotation import up_in_body
 from exo_gravity.core.errors import DataError
-from exo_gravity.core.safety.drive import State
+from exo_gravity.core.safety.command import State
 from exo_gravity.core.safety.limits import MAX_EFFORT
 from exo_gravity.core.trunk.inputs import NOT_REPORTED
 from exo_gravity.core.vocabulary import NONE, Source

@@ -12,7 +12,7 @@ import numpy as np
 
 from exo_gravity.core.arm.interface import STANDARD_GRAVITY
 from exo_gravity.core.arm.tilt import pitch_roll
-from exo_gravity.core.safety.drive import State
+from exo_gravity.core.safety.command import State
 from exo_gravity.core.vocabulary import TEXT, Source
 from exo_gravity.lab.bag import content
 from exo_gravity.lab.bag.content import JOINT_STATE, STRING, Event

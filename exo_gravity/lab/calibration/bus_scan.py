@@ -123,7 +123,7 @@ class BusScan(contextlib.ExitStack):
         lock = BusLock(address, f"calibrate motors (PID {os.getpid()})", clock=clock)
         self.callback(lock.release)
         try:
-            if lock.notes.drive.powered:
+            if lock.notes.command.powered:
                 raise BusError(
                     f"CAN bus {self.name}: the last can_bridge died and may have left the motors on: start can_bridge, "
                     "which lets the arm down, and stop it"

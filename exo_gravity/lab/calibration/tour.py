@@ -24,7 +24,7 @@ from exo_gravity.core.errors import DataError, ExoGravityError
 from exo_gravity.core.motors.joint_motor import MOTOR_PARAMETERS, JointSample
 from exo_gravity.core.numbers import Torque
 from exo_gravity.core.params import Param, table_for
-from exo_gravity.core.safety.drive import Efforts
+from exo_gravity.core.safety.command import Efforts
 from exo_gravity.core.safety.limits import CAN_BRIDGE, Limits
 from exo_gravity.lab.calibration.moment_model import model_of
 from exo_gravity.lab.calibration.poses import Itinerary, TorqueGuess, friction_stations, guess_for

@@ -19,7 +19,7 @@ from rich.console import Console
 from rich.progress import track
 
 from exo_gravity.core.errors import DataError, ParameterError
-from exo_gravity.core.safety.drive import State
+from exo_gravity.core.safety.command import State
 from exo_gravity.core.vocabulary import Source
 from exo_gravity.lab.bag.content import Bag
 from exo_gravity.lab.inputs.arms import recorded_of

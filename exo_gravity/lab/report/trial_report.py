@@ -22,7 +22,7 @@ from rich.markup import escape as marked
 
 from exo_gravity.core.compensation.guidance import CAUSE_TIME
 from exo_gravity.core.errors import DataError, ParameterError
-from exo_gravity.core.safety.drive import FaultCode
+from exo_gravity.core.safety.command import FaultCode
 from exo_gravity.core.safety.limits import Limits, limits_of
 from exo_gravity.core.vocabulary import NONE, Source
 from exo_gravity.lab.bag.content import BRIDGE, Bag, Event

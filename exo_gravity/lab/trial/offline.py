@@ -22,7 +22,7 @@ from exo_gravity.core.compensation.compensator import Compensator
 from exo_gravity.core.compensation.settings import Settings
 from exo_gravity.core.errors import DataError, ParameterError, named
 from exo_gravity.core.motors.joint_motor import JointMotor, JointSample
-from exo_gravity.core.safety.drive import CARRYING, Efforts, Fault, State
+from exo_gravity.core.safety.command import CARRYING, Efforts, Fault, State
 from exo_gravity.core.safety.limits import Limits
 from exo_gravity.core.vocabulary import NONE
 from exo_gravity.hardware.trunk_estimator import VQF, ImuSample, TrunkEstimator

@@ -12,7 +12,7 @@ from typing import NamedTuple
 import numpy as np
 
 from exo_gravity.core.errors import DataError
-from exo_gravity.core.safety.drive import State
+from exo_gravity.core.safety.command import State
 
 
 @dataclass(frozen=True)

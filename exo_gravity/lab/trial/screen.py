@@ -15,7 +15,7 @@ from rich.console import Console, Group
 from rich.live import Live
 from rich.text import Text
 
-from exo_gravity.core.safety.drive import State
+from exo_gravity.core.safety.command import State
 from exo_gravity.core.vocabulary import NONE
 from exo_gravity.sim.script import Step, TrialScript
 

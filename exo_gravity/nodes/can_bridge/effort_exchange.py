@@ -20,7 +20,7 @@ from sensor_msgs.msg import JointState
 
 from exo_gravity.core.errors import ParameterError
 from exo_gravity.core.motors.joint_motor import JointSample
-from exo_gravity.core.safety.drive import CARRYING, NO_EFFORTS, Efforts, FaultCode
+from exo_gravity.core.safety.command import CARRYING, NO_EFFORTS, Efforts, FaultCode
 from exo_gravity.core.safety.limits import Limits
 from exo_gravity.core.vocabulary import NO_REASON, Reason, RefusedEfforts
 from exo_gravity.hardware.control_loop import ControlLoop

@@ -27,7 +27,7 @@ from rclpy.signals import SignalHandlerOptions
 from exo_gravity.core.arm.tilt import SIDES
 from exo_gravity.core.errors import BusError, ExoGravityError, ParameterError
 from exo_gravity.core.motors.joint_motor import OPTIONS, motors_of, traffic_of
-from exo_gravity.core.safety.drive import NO_EFFORTS, FaultCode, State
+from exo_gravity.core.safety.command import NO_EFFORTS, FaultCode, State
 from exo_gravity.core.safety.limits import CAN_BRIDGE, check_bridge, limits_of
 from exo_gravity.core.safety.machine import SafetyMachine
 from exo_gravity.core.trunk.inputs import TiltInput
@@ -36,7 +36,7 @@ from exo_gravity.hardware.can_port import ArmOnBus, serials_of
 from exo_gravity.hardware.clock import request_real_time
 from exo_gravity.hardware.control_loop import ControlLoop
 from exo_gravity.hardware.motor_bus import MotorBus
-from exo_gravity.hardware.network import keep_to_this_machine
+from exo_gravity.hardware.network import restrict_to_localhost
 from exo_gravity.hardware.owned_bus import OwnedBus, Watchdog, take_over
 from exo_gravity.nodes.can_bridge import operation
 from exo_gravity.nodes.can_bridge.effort_exchange import Answer, EffortExchange
@@ -237,7 +237,7 @@ class CanBridge(LifecycleNode):
     def _check_watchdog(self, watchdog: Watchdog, loop: ControlLoop) -> None:
         """Let no motor be switched on before the watchdog watches, and none stay on without it or this node."""
         loop.attended = time.monotonic()
-        loop.hindrance = Reason(Wait.WATCHDOG, "the watchdog to start") if watchdog.is_starting else NO_REASON
+        loop.setup_error = Reason(Wait.WATCHDOG, "the watchdog to start") if watchdog.is_starting else NO_REASON
         if not watchdog.alive and loop.safety.state is not State.LETTING_DOWN:
             loop.trip(FaultCode.WATCHDOG_DEAD, "the watchdog process has died, is frozen, or did not start")
 
@@ -262,7 +262,7 @@ def main(make_node: Callable[[], CanBridge] = CanBridge) -> None:
     """Entry point of the executable `can_bridge`; with RECOVER, the exit code is 0 if no motor is on."""
     if not (patience := os.environ.get(RECOVER)):
         raise SystemExit(run(make_node, priority=20))
-    keep_to_this_machine()
+    restrict_to_localhost()
     # The launcher shows the log. A log file cannot be opened on a full disk, which must not leave the motors on.
     rclpy.init(args=[*sys.argv, *WITHOUT_LOG_FILE], signal_handler_options=SignalHandlerOptions.NO)
     node = rclpy.create_node("can_bridge", automatically_declare_parameters_from_overrides=True)

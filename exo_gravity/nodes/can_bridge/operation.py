@@ -31,7 +31,7 @@ from exo_gravity.core.motors.joint_motor import (
     source_of_bus,
 )
 from exo_gravity.core.numbers import Rate
-from exo_gravity.core.safety.drive import Efforts, FaultCode, State
+from exo_gravity.core.safety.command import Efforts, FaultCode, State
 from exo_gravity.core.safety.lease import Lease
 from exo_gravity.core.safety.machine import SafetyMachine
 from exo_gravity.core.safety.start import at_least, turns_back
@@ -100,7 +100,7 @@ class BridgeServices:
     """Creates the services on `node`.
 
     get_loop: returns the present control loop, None while the node is inactive.
-    hindrance: returns why the arm may not be armed now; '' if it may.
+    refusal: returns why the arm may not be armed now; '' if it may.
     last: the request that was answered last, and the Answer.
 
     Each method below, on the control thread, does what its service is for and returns why it is refused, or ''.
@@ -111,12 +111,12 @@ class BridgeServices:
         node: Node,
         get_loop: Callable[[], ControlLoop | None],
         motors: Sequence[JointMotor],
-        hindrance: Callable[[], str],
+        refusal: Callable[[], str],
     ) -> None:
         self.last: tuple[str, str] = NONE, Answer.NONE
         self._node = node
         self._get_loop = get_loop
-        self._hindrance = hindrance
+        self._refusal = refusal
         self._arming: set[futures.Future[str]] = set()  # requests that are not yet carried out
         self._motors = tuple(motors)
         # A callback that waits keeps no other waiting
@@ -186,8 +186,8 @@ class BridgeServices:
                 waiting.cancel()
         elif too_old := why_too_old(age_of_request(self._node)):
             return Reason(Answer.TOO_OLD, too_old)
-        elif hindrance := self._hindrance():
-            return Reason(Answer.LEAVING, hindrance)
+        elif refusal := self._refusal():
+            return Reason(Answer.LEAVING, refusal)
         future = loop.call(lambda: function(loop, request))
         if not lets_down:
             self._arming.add(future)
@@ -321,8 +321,8 @@ class BridgeReport:
         warnings: dict[BridgeWarning, str] = {}
         if acting != NONE:
             warnings[BridgeWarning.LIMITED] = f"limited by {acting}"
-        if now - safety.ride.ended < RECENT:
-            warnings[BridgeWarning.LATE_EFFORTS] = f"riding through: {safety.ride.why}"
+        if now - safety.stale.seen < RECENT:
+            warnings[BridgeWarning.LATE_EFFORTS] = f"still used: {safety.stale.why}"
         if hot:
             warnings[BridgeWarning.ABOVE_RATED_TORQUE] = f"above rated torque for too long: {', '.join(hot)}"
         if odd := loop.bus.boards.odd_temperature:
@@ -346,7 +346,7 @@ class BridgeReport:
             "rate (Hz)": f"{rate:.1f}",
             "bus load (%)": row([100.0 * bus.load(rate) if rate else 0.0 for bus in self._traffic.values()], 0),
             "age of efforts (ms)": milliseconds(now - newest.answered),
-            "rides": safety.ride.rides,
+            "rides": safety.stale.count,
             "cycles": loop.cycles,
             "late cycles": loop.late,
             "incomplete cycles": loop.incomplete,

@@ -23,8 +23,8 @@ from rclpy.signals import SignalHandlerOptions
 
 from exo_gravity.core.errors import ExoGravityError
 from exo_gravity.core.vocabulary import NONE, UNKNOWN, ClockState
-from exo_gravity.hardware.clock import favour
-from exo_gravity.hardware.network import check_environment, keep_to_this_machine, kept_to_this_machine
+from exo_gravity.hardware.clock import raise_priority
+from exo_gravity.hardware.network import check_environment, localhost_notice, restrict_to_localhost
 from exo_gravity.nodes.ros.inner import NodeExecutor
 from exo_gravity.nodes.ros.messages import ERROR, OK, Diagnostics
 
@@ -54,11 +54,11 @@ def run(make_node: Callable[[], Node], priority: int = 0) -> int:
     if {"-h", "--help"}.intersection(sys.argv[1:]):
         sys.stdout.write((inspect.getdoc(inspect.getmodule(make_node)) or "") + HELP.format(name=executable))
         return 0
-    keep_to_this_machine()
+    restrict_to_localhost()
     ending: list[int] = []
     handle_signals(ending)
     if priority:
-        favour(priority)
+        raise_priority(priority)
     with contextlib.suppress(OSError):
         Path("/proc/self/comm").write_text(executable)  # for ps, top and pgrep
     try:
@@ -69,7 +69,7 @@ def run(make_node: Callable[[], Node], priority: int = 0) -> int:
         get_logger(executable).fatal(str(error))
         os._exit(2)  # without closing Fast DDS, which can hang when it is closed during discovery
     is_supervised = bool(os.environ.get("EXO_GRAVITY_SUPERVISED"))
-    if not is_supervised and (sentence := kept_to_this_machine()):  # else the launcher says it, once for all
+    if not is_supervised and (sentence := localhost_notice()):  # else the launcher says it, once for all
         node.get_logger().info(sentence)
     if is_supervised:
         threading.Thread(target=_end_with_launcher, args=(node, ending), daemon=True).start()

@@ -175,7 +175,7 @@ def test_a_bus_that_a_bridge_holds_or_has_left_with_motors_on_is_refused_and_fre
     for _ in range(2):
         scan_of(wire).close()
     lock = BusLock(ADDRESS, "a bridge")
-    lock.notes.note(lock.notes.drive._replace(powered=True))
+    lock.notes.note(lock.notes.command._replace(powered=True))
     lock.release()
     with pytest.raises(BusError, match="may have left the motors on: start can_bridge"):
         scan_of(wire)

@@ -15,7 +15,7 @@ from exo_gravity.core import ArmModel, gravity_torque
 from exo_gravity.core.arm.springs import link_angles
 from exo_gravity.core.arm.tilt import Tilt
 from exo_gravity.core.errors import DataError
-from exo_gravity.core.safety.drive import FaultCode, State
+from exo_gravity.core.safety.command import FaultCode, State
 from exo_gravity.core.safety.limits import Limits
 from exo_gravity.lab.calibration.identification import fit_friction
 from exo_gravity.lab.calibration.moment_model import MomentModel

@@ -96,7 +96,7 @@ class Send(Enum):
     CLEAR_ERROR = "clear error"  #: forgets an error that keeps it off; polled where a board has no such frame
 
 
-class Drive(NamedTuple):
+class Command(NamedTuple):
     """What the motors receive in one cycle."""
 
     effort: tuple[float, ...]  #: (n,) Nm
@@ -105,7 +105,7 @@ class Drive(NamedTuple):
     powered: bool  #: whether one of them may be on
 
     @classmethod
-    def off(cls, count: int) -> "Drive":
+    def off(cls, count: int) -> "Command":
         """Return what `count` motors receive that are off: nothing to apply."""
         return cls((0.0,) * count, (0.0,) * count, (Send.POLL,) * count, False)
 
