@@ -22,7 +22,7 @@ from typing import Any, Protocol
 from exo_gravity.core.errors import BusError
 from exo_gravity.core.motors.joint_motor import REPLY_SHARE, JointSample
 from exo_gravity.core.safety.command import CARRYING, NO_EFFORTS, Command, Efforts, FaultCode, Send, State
-from exo_gravity.core.safety.limits import DAMPING
+from exo_gravity.core.safety.limits import DAMPING, Limits
 from exo_gravity.core.safety.machine import SafetyMachine
 from exo_gravity.core.safety.watch import RestTracker
 from exo_gravity.core.vocabulary import NO_REASON, Reason, Wait
@@ -78,12 +78,13 @@ class NoController:
 
 
 class ControlLoop:
-    """Owns `bus` and `safety` until it has ended. Its clock is that of the bus.
+    """Owns `bus`, and the state machine of its arm, until it has ended. Its clock is that of the bus.
 
-    It begins by finding out whether a motor is on (`SafetyMachine.probe`), unless `safety` already lets an arm down.
+    It begins by finding out whether a motor is on (`SafetyMachine.probe`).
 
     `start` repeats `cycle` on a thread. A loop that was not started is run by its owner, one `cycle` after another.
 
+    limits: of the arm.
     period: s of a cycle.
     controller: what the arm is carried by.
     hand_over: requests the watchdog, for a reason, to end this process and let the arm down; returns whether one is
@@ -93,13 +94,13 @@ class ControlLoop:
     def __init__(
         self,
         bus: MotorBus,
-        safety: SafetyMachine,
+        limits: Limits,
         period: float,
         controller: Controller,
         hand_over: Callable[[str], bool] = lambda reason: False,
     ) -> None:
-        #: The state machine. It starts in its present state, DISABLED unless a `call` changed it.
-        self.safety = safety
+        #: The state machine, for a `call`, or between two cycles.
+        self.safety = SafetyMachine(limits, period, bus.motors)
         #: s of a cycle; it may change between two cycles.
         self.period = period
         #: Counts of all cycles, of those that began more than a period late, and of those in which not every motor
@@ -119,8 +120,7 @@ class ControlLoop:
         self._now = bus.clock.monotonic
         self.controller = controller
         self._hand_over = hand_over
-        if safety.state is State.DISABLED:
-            safety.probe(self._now())
+        self.safety.probe(self._now())
         self._due = self._now()  # of the next cycle
         self._errors = 0  # in a row
         self._command = Command.off(len(bus.samples))  # last decided

@@ -95,7 +95,7 @@ class MotorBus:
         self._ports = tuple(ports)
         self._buses = list(dict.fromkeys(port for port in ports if port))
         self._failed: dict[CanPort, BusError] = {}  # in this cycle
-        self._motors = tuple(motors)
+        self.motors = tuple(motors)
         self._joints = frozenset(joint for joint, port in enumerate(self._ports) if port)  # on these buses
         # The ID of each motor's replies by its own ID, on each bus, for each wire format.
         self._ids: dict[tuple[CanPort | None, WireFormat], dict[int, int]] = {}
@@ -122,7 +122,7 @@ class MotorBus:
     @property
     def late_replies(self) -> str:
         """Which motor answers commands that are too old, as a sentence; '' if none does."""
-        for motor, requests in zip(self._motors, self._requests, strict=True):
+        for motor, requests in zip(self.motors, self._requests, strict=True):
             if requests.late:
                 return f"motor {motor.can_id} answers commands that are {1000.0 * requests.late:.0f} ms old or older"
         return ""
@@ -143,7 +143,7 @@ class MotorBus:
         self._raise_failure()
         replies = self._answered & self._asked
         if self.foreign_commands or replies:
-            heard = self.foreign_command or f"motor {self._motors[min(replies)].can_id} replies to another host"
+            heard = self.foreign_command or f"motor {self.motors[min(replies)].can_id} replies to another host"
             names = " or ".join(port.name for port in self._buses)
             raise BusError(f"CAN bus {names} is in use: {heard}; stop the other commander first")
 
@@ -216,7 +216,7 @@ class MotorBus:
             self._failed.clear()
             self._answered.clear()
             for joint in left:
-                self._send(self._ports[joint], *self._motors[joint].exit)
+                self._send(self._ports[joint], *self.motors[joint].exit)
             with contextlib.suppress(BusError):
                 self.receive_until(self._now() + LAST_REPLIES, lambda: self._answered >= self._asked.intersection(left))
         self.close()
@@ -240,7 +240,7 @@ class MotorBus:
 
     def _frames(self, joint: int, now: float) -> tuple[Frame, ...]:
         """Return what a motor is sent of the present command."""
-        send, motor = self._command.send[joint], self._motors[joint]
+        send, motor = self._command.send[joint], self.motors[joint]
         if send is Send.COMMAND:
             return (self._command_frame(joint, now),)
         if send is Send.POLL:
@@ -289,12 +289,12 @@ class MotorBus:
                 self.boards.heard(self._joint_of[can_id], kind, frame, self._now())
             return
         joint, now = self._joint_of[can_id], self._now()
-        if len(message.data) == self._motors[joint].wire_format.alias_length:
+        if len(message.data) == self.motors[joint].wire_format.alias_length:
             self._aliased.add(can_id)
         asked = self._requests[joint].replied(now) if self.replies[joint] else now
-        sample = self._motors[joint].sample(message.data, asked)
+        sample = self.motors[joint].sample(message.data, asked)
         self.boards.take(joint, sample)
-        if self._motors[joint].scale_slope and sample.temperature is not None:
+        if self.motors[joint].scale_slope and sample.temperature is not None:
             self._follow_temperature(joint, sample)
         self._answered.add(joint)
         if sample.time - self._contested[joint] < CONTEST_TIME:
@@ -325,7 +325,7 @@ class MotorBus:
 
     def _command_frame(self, joint: int, now: float) -> Frame:
         """Return the frame of the last command to a motor. If the motor is contested, it also holds the joint."""
-        motor, effort, damping = self._motors[joint], self._command.effort[joint], self._command.damping[joint]
+        motor, effort, damping = self.motors[joint], self._command.effort[joint], self._command.damping[joint]
         if now - self._contested[joint] < CONTEST_TIME and (hold := self._hold(joint, now)):
             damping = max(DAMPING, damping)
             if not math.isnan(self._held[joint]):
@@ -337,7 +337,7 @@ class MotorBus:
     def _oppose(self, joint: int, foreign: bytes) -> None:
         """Answer a foreign command with our last one, under the motor's full damping; hold the joint meanwhile."""
         now = self._now()
-        motor = self._motors[joint]
+        motor = self.motors[joint]
         self.foreign_commands += 1
         self._contested[joint] = now
         self.foreign_command = f"another sender commands motor {motor.can_id} (frame [{foreign.hex(' ')}])"

@@ -18,7 +18,6 @@ from multiprocessing import Pipe
 
 from exo_gravity.core.errors import BusError
 from exo_gravity.core.safety.command import Send
-from exo_gravity.core.safety.machine import SafetyMachine
 from exo_gravity.core.safety.watch import excess_torque, expected_torque
 from exo_gravity.hardware.bus_lock import ATTEMPT_TIME, ArmNotes, BusLock, bus_name
 from exo_gravity.hardware.can_port import ArmOnBus, CanPort
@@ -81,19 +80,18 @@ def let_down(arm: ArmOnBus, notes: ArmNotes, log: Callable[[str], None], is_want
         expected = expected_torque(effort[i], damping[i], joint.velocity)
         if excess_torque(joint.effort, expected) > 0.0:  # not without a reply: that is NaN
             effort[i], damping[i] = joint.effort, 0.0
-    machine = SafetyMachine(arm.limits, arm.period, arm.motors)
-    machine.take_over(effort, damping, clock.monotonic())
-    loop = ControlLoop(motors, machine, arm.period, NoController())
+    loop = ControlLoop(motors, arm.limits, arm.period, NoController())
+    loop.safety.take_over(effort, damping, clock.monotonic())
     was_unreached = False
     while not loop.is_off and loop.cycle():
-        if machine.is_unreached and not was_unreached:
+        if loop.safety.is_unreached and not was_unreached:
             log("a motor does not reply; it may still be powered; trying again")
-        was_unreached = machine.is_unreached
+        was_unreached = loop.safety.is_unreached
         if was_unreached and is_wanted():
             motors.close()
             return False
     loop.stop()
-    if not machine.is_off:
+    if not loop.is_off:
         return False
     return not left or let_down(replace(arm, joints=left), notes, log, is_wanted)
 

@@ -27,7 +27,6 @@ from exo_gravity.core.motors.joint_motor import JointMotor, JointSample, source_
 from exo_gravity.core.numbers import rate_limited
 from exo_gravity.core.safety.command import Efforts, State
 from exo_gravity.core.safety.limits import Limits
-from exo_gravity.core.safety.machine import SafetyMachine
 from exo_gravity.core.vocabulary import Source
 from exo_gravity.hardware.bus_lock import BusLock
 from exo_gravity.hardware.can_port import ArmOnBus
@@ -347,7 +346,7 @@ def accept_arm(params: Path, output: Path, arm: ConfiguredArm, weight: Weight, p
         held.callback(bus.close)
         bus.listen()
         lift = Lift(arm.limits, period)
-        loop = ControlLoop(bus, SafetyMachine(arm.limits, period, arm.motors), period, lift)
+        loop = ControlLoop(bus, arm.limits, period, lift)
         loop.start()
         held.callback(loop.stop)
         bench = Bench(loop, lift, arm.motors, model, weight, time.sleep, person.wait, COMPUTER_CLOCK)

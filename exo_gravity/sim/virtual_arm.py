@@ -18,7 +18,6 @@ from exo_gravity.core.errors import ParameterError
 from exo_gravity.core.motors.joint_motor import JointMotor
 from exo_gravity.core.safety.command import Command
 from exo_gravity.core.safety.limits import HANGING, Limits
-from exo_gravity.core.safety.machine import SafetyMachine
 from exo_gravity.hardware.can_port import CanPort
 from exo_gravity.hardware.control_loop import Controller, ControlLoop
 from exo_gravity.hardware.motor_bus import MotorBus
@@ -81,8 +80,8 @@ class VirtualArm:
         if ports is None:
             ports = [CanPort(self.wire.open(), self.clock, self.wire.open, any(device.is_fd))] * len(motors)
         self.bus = MotorBus(ports, motors, note=note, clock=self.clock)
-        self.safety = SafetyMachine(replace(limits, start_pose=HANGING), 1.0 / rate, motors)
-        self.loop = ControlLoop(self.bus, self.safety, 1.0 / rate, controller, hand_over)
+        self.loop = ControlLoop(self.bus, replace(limits, start_pose=HANGING), 1.0 / rate, controller, hand_over)
+        self.safety = self.loop.safety
 
     @property
     def now(self) -> float:

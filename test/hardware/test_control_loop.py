@@ -17,7 +17,6 @@ from exo_gravity.core.motors.frames import WireFormat
 from exo_gravity.core.numbers import NO_TORQUE
 from exo_gravity.core.safety.command import FaultCode, State
 from exo_gravity.core.safety.limits import DAMPING
-from exo_gravity.core.safety.machine import SafetyMachine
 from exo_gravity.core.safety.watch import Power
 from exo_gravity.hardware import control_loop
 from exo_gravity.hardware.can_port import CanPort, message_of
@@ -188,7 +187,7 @@ def test_a_cycle_that_took_too_long_is_counted_and_not_made_up():
 def test_the_thread_runs_the_cycles_until_the_loop_is_stopped():
     wire = can.Bus(interface="virtual", channel="test_control_loop")
     bus = MotorBus([CanPort(wire, COMPUTER_CLOCK)] * len(MOTORS_OF_ARM), MOTORS_OF_ARM)
-    loop = ControlLoop(bus, SafetyMachine(LIMITS, CYCLE), CYCLE, NoController())
+    loop = ControlLoop(bus, LIMITS, CYCLE, NoController())
     loop.start()
     assert loop.call(lambda: loop.cycles).result(10.0) >= 0
     assert loop.stop(10.0)
@@ -280,9 +279,9 @@ def test_a_command_to_a_motor_that_is_on_the_other_bus_is_no_foreign_command() -
 
 def next_loop(arm: CarriedArm) -> ControlLoop:
     """Return the loop of an owner that knows nothing of the last one."""
-    bus, limits = MotorBus(arm.on_bus.ports(arm.clock), arm.on_bus.motors, clock=arm.clock), arm.on_bus.limits
+    bus = MotorBus(arm.on_bus.ports(arm.clock), arm.on_bus.motors, clock=arm.clock)
     bus.listen()
-    return ControlLoop(bus, SafetyMachine(limits, CYCLE, arm.on_bus.motors), CYCLE, NoController())
+    return ControlLoop(bus, arm.on_bus.limits, CYCLE, NoController())
 
 
 @pytest.mark.parametrize(

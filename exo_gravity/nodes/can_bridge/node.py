@@ -29,7 +29,6 @@ from exo_gravity.core.errors import BusError, ExoGravityError, ParameterError
 from exo_gravity.core.motors.joint_motor import OPTIONS, motors_of, traffic_of
 from exo_gravity.core.safety.command import NO_EFFORTS, FaultCode, State
 from exo_gravity.core.safety.limits import CAN_BRIDGE, check_bridge, limits_of
-from exo_gravity.core.safety.machine import SafetyMachine
 from exo_gravity.core.trunk.inputs import TiltInput
 from exo_gravity.core.vocabulary import NO_REASON, Reason, Wait
 from exo_gravity.hardware.can_port import ArmOnBus, serials_of
@@ -154,9 +153,7 @@ class CanBridge(LifecycleNode):
         self._exchange.newest = NO_EFFORTS
         assert self._owned, "the node is not configured"
         bus, self._bus = self._bus or self._owned.open(), None
-        period = self._arm.period
-        safety = SafetyMachine(self._arm.limits, period, self._arm.motors)
-        loop = ControlLoop(bus, safety, period, self._exchange, self._owned.watchdog.hand_over)
+        loop = ControlLoop(bus, self._arm.limits, self._arm.period, self._exchange, self._owned.watchdog.hand_over)
         loop.start()
         try:
             request_real_time(self._thread_priority, self.get_logger().warning)
@@ -165,7 +162,7 @@ class CanBridge(LifecycleNode):
             raise
         self.loop = loop
         self._check_watchdog(self._owned.watchdog, loop)
-        loop.call(lambda: safety.enable(time.monotonic()))
+        loop.call(lambda: loop.safety.enable(time.monotonic()))
 
     @_transition
     def on_deactivate(self) -> None:
