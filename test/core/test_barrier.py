@@ -144,7 +144,26 @@ def test_a_wall_pushes_back_before_a_joint_limit():
         arm = barrier()
         effort, damping = arm.shape(1.0, joints(position=position), NO_TORQUE, WHOLE, NO_TORQUE, is_guided=False)
         assert effort[3] == pytest.approx(sign * 1.25) and damping[3] == 5.0
-        assert "soft wall (d)" in arm.acted
+        assert arm.joints[3].limiting == ["soft wall (d)"]
+
+
+@pytest.mark.parametrize(
+    ("cause", "velocity", "effort", "asked"),
+    [
+        ("guided motion (b)", 1.0, 0.0, {"is_guided": True}),
+        ("late efforts (b)", 1.0, 0.0, {"is_guided": False, "late": DAMPING}),
+        ("torque withheld (b)", -0.3, 9.0, {"is_guided": False}),
+        ("still joint (b)", 0.0, 3.0, {"is_guided": False}),
+        ("brake (b)", 3.0, 3.0, {"is_guided": False}),
+        ("", 1.0, 3.0, {"is_guided": False}),
+    ],
+)
+def test_what_damps_a_joint_most_is_named(cause, velocity, effort, asked):
+    arm, sample, torque = barrier(), joints(velocity=velocity), (0.0, effort, 0.0, 0.0)
+    for _ in range(100):
+        given, damping = arm.shape(PERIOD, sample, torque, WHOLE, torque, **asked)
+        arm.damping(PERIOD, sample, HEARD, given, damping, is_late=False)
+    assert arm.joints[1].cause == cause
 
 
 def descend(joint: JointDescent, velocity: float, duration: float) -> list[float]:

@@ -68,9 +68,10 @@ class SafetyMachine:
     motors: of the arm, which bound its torque and damping; by default `max_effort` does, and nothing.
 
     state: the State. fault: the latched Fault or None. waiting_for: what CHECKING or PROVING waits for. refusal: why
-    the last enable was refused without a fault. acted: for each limit that has acted, by name, the last time. watch:
-    what is known of each motor. stale: efforts that are late. motion: judges the efforts by gravity alone. pose: the
-    question to the operator whether the arm hangs as it is drawn. signs: the proof of signs.
+    the last enable was refused without a fault. acted, damped: when each limit of a torque, and each cause of damping,
+    has acted last, by name. watch: what is known of each motor. stale: efforts that are late. motion: judges the
+    efforts by gravity alone. pose: the question to the operator whether the arm hangs as it is drawn. signs: the proof
+    of signs.
     """
 
     def __init__(self, limits: Limits, period: float, motors: Sequence[JointMotor] = ()) -> None:
@@ -79,6 +80,7 @@ class SafetyMachine:
         self.fault: Fault | None = None
         self.waiting_for = self.refusal = NO_REASON
         self.acted: dict[str, float] = {}
+        self.damped: dict[str, float] = {}
         self.stale = StaleEfforts(limits.command_timeout)
         self._stale_while_checking = StaleEfforts(limits.command_timeout)
         self._period = period
@@ -356,8 +358,11 @@ class SafetyMachine:
         share = [1.0 - left for left in self._rise.shares]
         late = DAMPING if self.stale.are_used else 0.0
         torque, damping = self.shaper.shape(self._dt, joints, effort, share, self._sent.effort, is_guided, late)
-        self.acted.update(dict.fromkeys(self.shaper.acted, self._now))
-        return self._powered(torque, damping, self._commands)
+        command = self._powered(torque, damping, self._commands)
+        for joint in self.shaper.joints:
+            self.acted.update(dict.fromkeys(joint.limiting, self._now))
+            self.damped[joint.cause] = self._now
+        return command
 
     def _descend(self) -> Command:
         """Return a command that lowers the arm, or stands once it is down."""

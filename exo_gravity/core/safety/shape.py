@@ -61,6 +61,7 @@ class BarrierTuning:
     #: s, time constant with which the brake falls. It rises at once; if it fell so, a light arm would be thrown and
     #: caught by turns, one cycle each
     hold: float = 0.05
+    felt: float = 0.05  #: Nm s/rad; the cause of less is not told
     calm: float = 0.25  #: rad/s, `driven_speed` while a motor is late: that of a guided motion
     still: float = 0.75  #: rad/s, from which on a motor then drives no joint; 1.25 lets seven joints reach 0.78 (0.58)
 
@@ -102,11 +103,17 @@ BARRIER, STILLNESS, VIBRATION = BarrierTuning(), StillnessTuning(), VibrationLim
 
 
 class JointShaper:
-    """Shapes what the motor of joint `i` gets; peak: the most that it can apply, Nm s/rad."""
+    """Shapes what the motor of joint `i` gets; peak: the most that it can apply, Nm s/rad.
+
+    limiting: which limits acted on its torque in the last `shape`. cause: why it is damped, by the last `bound`.
+    """
 
     def __init__(self, limits: Limits, i: int, peak: float) -> None:
         self._name, self._limits, self._i, self._peak = limits.joint_names[i], limits, i, peak
-        self._slowly = 0.0  # Nm s/rad, of the causes that neither rise nor fall at once
+        self.limiting: Sequence[str] = ()
+        self.cause = self._cause = ""
+        # Nm s/rad, of the causes that neither rise nor fall at once, and the name of the last one
+        self._slowly, self._last = 0.0, ""
         self._slow = 0.0  # rad/s, the speed low-passed by BARRIER.lead
         self._brake = self._given = 0.0  # Nm s/rad, and all that was given last
         self._steady = math.inf  # Nm s/rad, the most that the joint gets of what is asked for
@@ -127,7 +134,6 @@ class JointShaper:
         is_guided: bool,
         late: float,
         is_empty: bool,
-        acted: set[str],
     ) -> tuple[float, float]:
         """Return torque (Nm) and damping (Nm s/rad) of a carried joint; see `Shaper.shape`. Raises ParameterError."""
         most, limit = self._limits.max_command[self._i], self._limits.max_effort[self._i]
@@ -141,17 +147,23 @@ class JointShaper:
         given = rate_limited(clamped, before, MAX_EFFORT_RATE * dt)
         # The compensator may have clamped it already: all that is permitted counts as clamped.
         missing = given if abs(given) >= permitted else wanted - given
-        withheld = DAMPING if missing * sample.velocity < 0.0 else 0.0
-        guided = guide_damping(sample.velocity) if is_guided else 0.0
-        self._slowly = rate_limited(max(guided, late, withheld), self._slowly, DAMPING_RATE * dt)
-        limiting = {
+        slow, cause = max(
+            (guide_damping(sample.velocity) if is_guided else 0.0, "guided motion"),
+            (late, "late efforts"),
+            (DAMPING if missing * sample.velocity < 0.0 else 0.0, "torque withheld"),
+        )
+        self._slowly = rate_limited(slow, self._slowly, DAMPING_RATE * dt)
+        self._last = cause if slow else self._last
+        acting = {
             "soft wall": wall > 0.0,
             "derating": permitted < limit,
             "max_effort": clamped != wanted,
             "max_effort_rate": given != clamped,
         }
-        acted.update([f"{name} ({self._name})" for name, acts in limiting.items() if acts])
-        return given, max(self._slowly, wall, self._hold(dt, sample, given, is_empty, is_guided))
+        self.limiting = [f"{name} ({self._name})" for name, acts in acting.items() if acts]
+        still = self._hold(dt, sample, given, is_empty, is_guided)
+        damping, self._cause = max((self._slowly, self._last), (wall, "soft wall"), (still, "still joint"))
+        return given, damping
 
     def _hold(self, dt: float, sample: JointSample, effort: float, is_empty: bool, is_guided: bool) -> float:
         """Return the damping in Nm s/rad of a joint that is still, or whose arm seems to be empty.
@@ -213,8 +225,11 @@ class JointShaper:
         if is_late:
             along = math.copysign(speed, effort * sample.velocity)
             needed = max(needed, _rising(effort, along, BARRIER.calm, BARRIER.still))
-        asked = min(damping, self._steady)
-        wanted = min(self._peak, asked if is_silent else max(asked, needed))
+        asked, cause = min(damping, self._steady), self._cause
+        if needed > asked and not is_silent:
+            asked, cause = needed, "brake"
+        self.cause = f"{cause} ({self._name})" if asked >= BARRIER.felt else ""
+        wanted = min(self._peak, asked)
         self._given = most / speed if wanted * speed > most else wanted
         return self._given
 
@@ -224,13 +239,11 @@ class Shaper:
 
     peak_damping: the most that each motor can apply, (n,) Nm s/rad.
 
-    acted: which limits acted in the last `shape`, for people.
     empty_for: s for which motors have driven joints as if what these carried had left them.
     """
 
     def __init__(self, limits: Limits, peak_damping: Sequence[float]) -> None:
-        self._joints = [JointShaper(limits, i, peak) for i, peak in enumerate(peak_damping)]
-        self.acted: set[str] = set()
+        self.joints = [JointShaper(limits, i, peak) for i, peak in enumerate(peak_damping)]
         self.empty_for = 0.0
 
     def shape(
@@ -254,14 +267,13 @@ class Shaper:
 
         Raises ParameterError if an effort is NaN or beyond `max_command`.
         """
-        self.acted = set()
-        columns = zip(self._joints, samples, effort, share, before, strict=True)
+        columns = zip(self.joints, samples, effort, share, before, strict=True)
         given = [
-            joint.shape(dt, sample, asked, part, last, is_guided, late, self.empty_for > 0.0, self.acted)
+            joint.shape(dt, sample, asked, part, last, is_guided, late, self.empty_for > 0.0)
             for joint, sample, asked, part, last in columns
         ]
-        is_empty = self.empty_for or any(joint.is_sudden for joint in self._joints)
-        is_alone = any(joint.is_driven for joint in self._joints) and not any(joint.is_moved for joint in self._joints)
+        is_empty = self.empty_for or any(joint.is_sudden for joint in self.joints)
+        is_alone = any(joint.is_driven for joint in self.joints) and not any(joint.is_moved for joint in self.joints)
         self.empty_for = self.empty_for + dt if is_empty and is_alone else 0.0
         return tuple([torque for torque, _ in given]), tuple([damping for _, damping in given])
 
@@ -280,7 +292,7 @@ class Shaper:
         silent: which motors (n,) do not reply: their speed is not known, so that it bounds nothing.
         damping: what is asked for, (n,) Nm s/rad. is_late: whether a motor is late with its replies.
         """
-        columns = zip(self._joints, samples, silent, effort, damping, strict=True)
+        columns = zip(self.joints, samples, silent, effort, damping, strict=True)
         return tuple([joint.bound(dt, sample, mute, tau, own, is_late) for joint, sample, mute, tau, own in columns])
 
 

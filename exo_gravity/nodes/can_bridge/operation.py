@@ -313,7 +313,10 @@ class BridgeReport:
             return
         now, safety = time.monotonic(), loop.safety
         fault, resume = safety.fault, safety.why_not_resumed  # read once: the control thread goes on
-        acting = words(*sorted(limit for limit, acted in tuple(safety.acted.items()) if acted > now - RECENT))
+        acting, damping = (
+            words(*sorted(name for name, acted in tuple(last.items()) if name and acted > now - RECENT))
+            for last in (safety.acted, safety.damped)
+        )
         rate = self._rate.update(now, loop.cycles)
         samples = loop.samples
         loads = self._motors.update(now, samples)
@@ -342,6 +345,7 @@ class BridgeReport:
             **operator,
             "warnings": words(*warnings),
             "limits acting": acting,
+            "damped by": damping,
             "joints above rated torque": words(*hot),
             "rate (Hz)": f"{rate:.1f}",
             "bus load (%)": row([100.0 * bus.load(rate) if rate else 0.0 for bus in self._traffic.values()], 0),
