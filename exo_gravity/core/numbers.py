@@ -17,6 +17,11 @@ NO_TORQUE: Torque = (0.0,) * JOINT_COUNT
 COVER = 1.96  # standard deviations of a 95 % band
 
 
+def clamp(value: float, limit: float) -> float:
+    """Return `value` within -`limit`..`limit`."""
+    return max(-limit, min(limit, value))
+
+
 def rate_limited(wanted: float, last: float, step: float) -> float:
     """Return `wanted` within `step` of `last`."""
     return max(last - step, min(last + step, wanted))

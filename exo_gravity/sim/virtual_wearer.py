@@ -9,7 +9,7 @@ limited to the strength of a hand. Hold: no torque. Push: half a sine wave of th
 import math
 from collections.abc import Sequence
 
-from exo_gravity.core.numbers import Torque, for_joints
+from exo_gravity.core.numbers import Torque, clamp, for_joints
 from exo_gravity.sim.script import TrialScript
 from exo_gravity.sim.trunk_motion import minimum_jerk
 
@@ -78,9 +78,9 @@ class VirtualWearer:
         for n, ((position, speed), *hand) in enumerate(zip(path, *compliance, strict=True)):
             stiffness, damping, integral = hand
             error = position - theta[n]
-            self._weight[n] = max(-limit, min(limit, self._weight[n] + integral * error * period))
+            self._weight[n] = clamp(self._weight[n] + integral * error * period, limit)
             pull = stiffness * error + damping * (speed - velocity[n]) + self._weight[n]
-            torque.append(max(-limit, min(limit, pull)))
+            torque.append(clamp(pull, limit))
         return tuple(torque)
 
 

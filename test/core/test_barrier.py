@@ -161,8 +161,7 @@ def test_a_wall_pushes_back_before_a_joint_limit():
 def test_what_damps_a_joint_most_is_named(cause, velocity, effort, asked):
     arm, sample, torque = barrier(), joints(velocity=velocity), (0.0, effort, 0.0, 0.0)
     for _ in range(100):
-        given, damping = arm.shape(PERIOD, sample, torque, WHOLE, torque, **asked)
-        arm.damping(PERIOD, sample, HEARD, given, damping, is_late=False)
+        arm.damping(PERIOD, sample, HEARD, *arm.shape(PERIOD, sample, torque, WHOLE, torque, **asked), is_late=False)
     assert arm.joints[1].cause == cause
 
 

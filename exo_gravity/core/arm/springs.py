@@ -20,7 +20,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from exo_gravity.core.numbers import JOINT_COUNT, Torque
+from exo_gravity.core.numbers import JOINT_COUNT, Torque, clamp
 
 # Nm/rad. An arm whose spring is not there is pushed away from `rest` with the stiffness that is entered: more than this
 # is about what gravity's own slope is on a light arm, g times 0.2 kg m.
@@ -47,7 +47,7 @@ class Springs:
     def torque(self, theta: Sequence[float]) -> Torque:
         """Return the torque (n,) in Nm that holds the joints at `theta` (n,) rad against their springs."""
         springs, reach = zip(self.stiffness, theta, self.rest, strict=True), self.reach
-        return tuple([k * max(-reach, min(reach, q - rest)) for k, q, rest in springs])
+        return tuple([k * clamp(q - rest, reach) for k, q, rest in springs])
 
     def torques(self, theta: np.ndarray) -> np.ndarray:
         """Return the same for poses (m, n) in rad: (m, n) Nm."""

@@ -9,7 +9,7 @@ applies it (core/safety/guidance.py).
 
 import math
 import operator
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from functools import partial
 from typing import NamedTuple, Protocol
@@ -22,7 +22,7 @@ from exo_gravity.core.compensation.guidance import DROP, PAUSE, TOUCH, DropWatch
 from exo_gravity.core.compensation.settings import Settings
 from exo_gravity.core.compensation.support import SupportRequest
 from exo_gravity.core.compensation.terms.terms import Terms, TermsInForce
-from exo_gravity.core.numbers import Torque, rate_limited
+from exo_gravity.core.numbers import Torque, clamp, rate_limited
 from exo_gravity.core.params import JOINT_NAMES
 from exo_gravity.core.trunk.inputs import TILT, FeltMotion, TiltInput
 from exo_gravity.core.vocabulary import NO_REASON, Reason, Withdrawal
@@ -161,7 +161,7 @@ class Compensator:
         client = self._active_client if velocity else None
         if client:
             torque = self._asked_for(client, at, torque)
-        torque = clamped(torque, s.max_effort)
+        torque = tuple(map(clamp, torque, s.max_effort))
         needs = partial(self._torque_of, at)
         change = self._change
         if not 0.0 <= dt <= PAUSE:
@@ -193,7 +193,7 @@ class Compensator:
             heaviest = MAX_PAYLOAD * self.settings.arm.gravity
             levers = self.settings.unit_load.torque(at.theta, at.tilt)
             self._most_asked = [CLIENT_EFFORT + heaviest * abs(lever) for lever in levers]
-        return tuple(map(operator.add, torque, clamped(map(operator.sub, asked, torque), self._most_asked)))
+        return tuple(map(operator.add, torque, map(clamp, map(operator.sub, asked, torque), self._most_asked)))
 
     def _follow_request(self, now: float) -> None:
         """Carry as much of the wearer's arm as is asked for."""
@@ -296,9 +296,4 @@ class Compensator:
             torque, _ = self._gravity(load.settings, reading)
         if reading.velocity:
             torque = tuple(map(operator.add, torque, self.terms.torque_of(load.terms)))
-        return clamped(torque, load.settings.max_effort)
-
-
-def clamped(torque: Iterable[float], limit: Sequence[float]) -> Torque:
-    """Return `torque` (n,) within -`limit`..`limit`, both in Nm."""
-    return tuple([max(-most, min(most, tau)) for tau, most in zip(torque, limit, strict=True)])
+        return tuple(map(clamp, torque, load.settings.max_effort))

@@ -26,6 +26,7 @@ from itertools import accumulate
 from exo_gravity.core.arm.rotation import ZERO, Floats3, Quaternion, cross, dot, plus, product, rotated
 from exo_gravity.core.arm.tilt import SIDES, Tilt
 from exo_gravity.core.motors.joint_motor import JointSample
+from exo_gravity.core.numbers import clamp
 from exo_gravity.core.safety.command import Fault, FaultCode
 from exo_gravity.core.safety.limits import Limits
 
@@ -126,7 +127,7 @@ class MotionMonitor:
         fault: Fault | None = None
         for i, full in enumerate(self.full):
             most = self._limits.max_effort[i]
-            torque = max(-most, min(most, effort[i]))
+            torque = clamp(effort[i], most)
             share = MOTION.share + max(MOTION.late, age) * fastest
             margin = MOTION.least + self._limits.largest_addition[i] + share * full
             low, high = lowest[i] - margin, highest[i] + margin

@@ -18,6 +18,7 @@ from typing import NamedTuple
 from exo_gravity.core.arm.interface import STANDARD_GRAVITY
 from exo_gravity.core.arm.rotation import ZERO, Floats3, Quaternion, cross, dot, plus, rotated, three_floats, up_in_body
 from exo_gravity.core.errors import ParameterError
+from exo_gravity.core.numbers import clamp
 from exo_gravity.core.trunk.inputs import NOT_REPORTED
 
 # The usual widest ranges of a MEMS sensor, and those that any sensor may have.
@@ -380,9 +381,10 @@ class ReportedTurns:
         change, middle = plus(up, last, -1.0), plus(ZERO, plus(up, last), 0.5)
         apart = cross(middle, plus(change, cross(turn, middle)))
         self._age += dt
-        share, most = min(1.0, dt / min(self._age, self.bias_time)), self.largest_bias
-        x, y, z = plus(self._bias, plus(plus(ZERO, apart, 1.0 / dt), self._bias, -1.0), share)
-        self._bias = max(-most, min(most, x)), max(-most, min(most, y)), max(-most, min(most, z))
+        share = min(1.0, dt / min(self._age, self.bias_time))
+        bias = plus(self._bias, plus(plus(ZERO, apart, 1.0 / dt), self._bias, -1.0), share)
+        x, y, z = (clamp(component, self.largest_bias) for component in bias)
+        self._bias = x, y, z
         kept, speed = 1.0 - min(1.0, dt / self.time), math.hypot(*change) / dt
         self._apart = plus(plus(apart, self._bias, -dt), self._apart, kept)
         self._fastest, self._jolt = max(speed, self._fastest * kept), max(jolt, self._jolt * kept)

@@ -363,14 +363,15 @@ class BridgeReport:
             "refused message text": refusal,
         }
         for name, joint, warmed, (power, rms, share) in zip(self._names, samples, self._warmed, loads, strict=True):
-            is_told = joint.temperature is not None
-            values[f"{name} temperature (degC)"] = joint.temperature if is_told else UNKNOWN
-            change = row([100.0 * warmed(joint.temperature)], 1) if is_told else UNKNOWN
-            values[f"{name} torque by temperature (%)"] = change
-            values[f"{name} torque (Nm)"] = row([joint.effort], 2)
-            values[f"{name} power (W)"] = row([power], 1)
-            values[f"{name} RMS torque (Nm)"] = row([rms], 2)
-            values[f"{name} RMS of rated torque (%)"] = row([100.0 * share], 0)
+            warmth = joint.temperature
+            values |= {
+                f"{name} temperature (degC)": UNKNOWN if warmth is None else warmth,
+                f"{name} torque by temperature (%)": UNKNOWN if warmth is None else row([100.0 * warmed(warmth)], 1),
+                f"{name} torque (Nm)": row([joint.effort], 2),
+                f"{name} power (W)": row([power], 1),
+                f"{name} RMS torque (Nm)": row([rms], 2),
+                f"{name} RMS of rated torque (%)": row([100.0 * share], 0),
+            }
         self._diagnostics.report(*_headline(loop, ", ".join(warnings.values())), values)
 
     def _start(self, safety: SafetyMachine, samples: Sequence[JointSample]) -> dict[str, object]:

@@ -24,6 +24,7 @@ from exo_gravity.core.errors import FrameError
 from exo_gravity.core.motors.ak import MASTER_ID, V3Format
 from exo_gravity.core.motors.frames import BROADCAST_ID, EXTENDED, Frame, MotorCommand, MotorReply, unpack_fields
 from exo_gravity.core.motors.joint_motor import JointMotor
+from exo_gravity.core.numbers import clamp
 from exo_gravity.core.params import check_owned, owned
 from exo_gravity.sim.motors.firmware import (
     AK,
@@ -312,8 +313,3 @@ def own_ids(joint: JointMotor, firmware: Firmware) -> dict[int, int]:
         elif firmware.obeys_broadcast:
             ids[frame_id & ~0xFF | BROADCAST_ID] = frame_id
     return ids
-
-
-def clamp(value: float, limit: float) -> float:
-    """Return `value` within -`limit`..`limit`."""
-    return value if -limit <= value <= limit else math.copysign(limit, value)

@@ -14,8 +14,8 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from exo_gravity.core.compensation.terms.catalogue import TermParameters, clamp
-from exo_gravity.core.numbers import JOINT_COUNT, Torque
+from exo_gravity.core.compensation.terms.catalogue import TermParameters
+from exo_gravity.core.numbers import JOINT_COUNT, Torque, clamp
 from exo_gravity.core.params import owned
 from exo_gravity.core.safety.limits import MAX_COMMAND
 from exo_gravity.core.vocabulary import NO_REASON, AssistProblem, Reason

@@ -29,7 +29,7 @@ import numpy as np
 
 from exo_gravity.core.arm.interface import Links
 from exo_gravity.core.errors import ParameterError
-from exo_gravity.core.numbers import JOINT_COUNT, Torque, for_joints
+from exo_gravity.core.numbers import JOINT_COUNT, Torque, clamp, for_joints
 from exo_gravity.core.params import check_owned, owned, params_of
 
 DELAY = 0.015  # s from a reading to its torque: 10 ms, and half of a 10 ms cycle in which the torque is held
@@ -236,11 +236,6 @@ class SoftLimits(TermParameters):
             damping = LATE * k * min(1.0, abs(depth) / SPRING.edge)
             torque.append(clamp(-k * depth, most) - damping * v)
         return tuple(torque)
-
-
-def clamp(value: float, limit: float) -> float:
-    """Return `value` limited to -limit..limit."""
-    return max(-limit, min(limit, value))
 
 
 @dataclass(frozen=True)

@@ -29,10 +29,9 @@ from exo_gravity.core.compensation.terms.catalogue import (
     SoftLimits,
     Spring,
     TermState,
-    clamp,
 )
 from exo_gravity.core.errors import ParameterError
-from exo_gravity.core.numbers import Torque, for_joints
+from exo_gravity.core.numbers import Torque, clamp, for_joints
 from exo_gravity.core.params import Param, params_of
 
 GROUP = "exo_gravity.terms"
