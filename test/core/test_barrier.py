@@ -117,7 +117,7 @@ def test_the_brake_leads_a_joint_that_speeds_up_by_as_much_at_any_rate(rate):
     for speed in np.arange(0.0, 2.0, acceleration * dt):
         brake = arm.damping(dt, joints(velocity=float(speed)), HEARD, (3.0,) * 4, NO_TORQUE, is_late=False)[0]
     led = speed + acceleration * BARRIER.lead - LIMITS.driven_speed
-    assert brake == pytest.approx(3.0 / FULL * led / BARRIER.span, rel=1e-3)
+    assert brake == pytest.approx(3.0 / FULL * led / BARRIER.span, rel=1e-3) and arm.joints[0].cause == "brake (a)"
 
 
 def test_the_speed_of_a_motor_that_does_not_reply_bounds_nothing():
@@ -128,10 +128,11 @@ def test_the_speed_of_a_motor_that_does_not_reply_bounds_nothing():
 
 
 def test_a_clamped_joint_is_damped_while_it_sinks_and_free_while_it_is_lifted():
-    asked = (3.0, 9.0, 2.0, 3.0)
-    arm = barrier()
+    arm, asked = barrier(), (3.0, 9.0, 2.0, 3.0)
     sinking = arm.shape(0.2, joints(velocity=-0.3), asked, WHOLE, asked, is_guided=False)
-    assert sinking[1] == pytest.approx((DAMPING, DAMPING, 0.0, DAMPING))
+    given = arm.damping(0.2, joints(velocity=-0.3), HEARD, *sinking, is_late=False)
+    assert given == sinking[1] == pytest.approx((DAMPING, DAMPING, 0.0, DAMPING))
+    assert [joint.cause for joint in arm.joints[1:3]] == ["torque withheld (b)", ""]
     lifted = arm.shape(0.1, joints(velocity=0.3), asked, WHOLE, asked, is_guided=False)
     assert lifted[1] == pytest.approx((0.5 * DAMPING, 0.5 * DAMPING, 0.0, 0.5 * DAMPING))
     hot = barrier().shape(0.2, joints(velocity=-0.3, temperature=80), asked, WHOLE, (1.0,) * 4, is_guided=False)
@@ -145,24 +146,6 @@ def test_a_wall_pushes_back_before_a_joint_limit():
         effort, damping = arm.shape(1.0, joints(position=position), NO_TORQUE, WHOLE, NO_TORQUE, is_guided=False)
         assert effort[3] == pytest.approx(sign * 1.25) and damping[3] == 5.0
         assert arm.joints[3].limiting == ["soft wall (d)"]
-
-
-@pytest.mark.parametrize(
-    ("cause", "velocity", "effort", "asked"),
-    [
-        ("guided motion (b)", 1.0, 0.0, {"is_guided": True}),
-        ("late efforts (b)", 1.0, 0.0, {"is_guided": False, "late": DAMPING}),
-        ("torque withheld (b)", -0.3, 9.0, {"is_guided": False}),
-        ("still joint (b)", 0.0, 3.0, {"is_guided": False}),
-        ("brake (b)", 3.0, 3.0, {"is_guided": False}),
-        ("", 1.0, 3.0, {"is_guided": False}),
-    ],
-)
-def test_what_damps_a_joint_most_is_named(cause, velocity, effort, asked):
-    arm, sample, torque = barrier(), joints(velocity=velocity), (0.0, effort, 0.0, 0.0)
-    for _ in range(100):
-        arm.damping(PERIOD, sample, HEARD, *arm.shape(PERIOD, sample, torque, WHOLE, torque, **asked), is_late=False)
-    assert arm.joints[1].cause == cause
 
 
 def descend(joint: JointDescent, velocity: float, duration: float) -> list[float]:

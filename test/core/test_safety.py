@@ -247,7 +247,8 @@ ROWS: dict[str, Sequence[Step]] = {
         has(lambda arm: arm.command.effort[1] == pytest.approx(6.75) and "derating (b)" in arm.machine.acted),
     ],
     "an arm that moves off as if it were empty is let down, and can be carried again": [
-        carried, wait(0.5), has(lambda arm: arm.command.damping == STILL), move(2, 0.25, 0.9),
+        carried, wait(0.5), has(lambda arm: arm.command.damping == STILL and "still joint (b)" in arm.machine.damped),
+            move(2, 0.25, 0.9),
         see(State.LETTING_DOWN, "load_missing"), until(State.FAULT), clear, enable, until(State.ACTIVE), see(fault=""),
     ],
     "the motors are switched off once nothing holds the arm and it rests": [
@@ -255,10 +256,11 @@ ROWS: dict[str, Sequence[Step]] = {
         has(lambda arm: arm.command.powered and arm.command[:2] == OFF[:2]),
         wait(2.1), see(State.DISABLED), wait(0.1), ALL_OFF,
     ],
-    "late efforts are ridden through under rising damping, which falls again": [
+    "stale efforts are used under rising damping, which falls again": [
         carried, wait(0.3), has(lambda arm: arm.command.damping == STILL), let(effort_age=LATE), wait(),
         has(lambda arm: 0.0 < min(arm.command.damping) < 0.2),
-        wait(0.1), see(State.ACTIVE), has(lambda arm: arm.machine.stale.count == 1),
+        wait(0.1), see(State.ACTIVE),
+        has(lambda arm: arm.machine.stale.count == 1 and "late efforts (a)" in arm.machine.damped),
         has(lambda arm: min(arm.command.damping) == pytest.approx(0.104 * DAMPING_RATE)),
         has(lambda arm: arm.command.effort == pytest.approx(EFFORT)),
         let(**FRESH), wait(0.12), see(State.ACTIVE), has(lambda arm: arm.command.damping == STILL),
@@ -517,7 +519,7 @@ def test_while_the_load_changes_only_a_joint_that_moves_is_damped_and_damping_ne
     for step in range(100):
         if step == 50:
             assert run.command.damping[:2] == (0.0, 0.0)
-            assert run.command.damping[2] == pytest.approx(GUIDANCE.brake)
+            assert run.command.damping[2] == pytest.approx(GUIDANCE.brake) and "guided motion (c)" in run.machine.damped
             assert 0.5 < 0.4 * run.command.damping[3] < GUIDANCE.brake
             run.damped = False
         moved = min(49, step) * PERIOD
