@@ -248,7 +248,7 @@ ROWS: dict[str, Sequence[Step]] = {
     ],
     "an arm that moves off as if it were empty is let down, and can be carried again": [
         carried, wait(0.5), has(lambda arm: arm.command.damping == STILL and "still joint (b)" in arm.machine.damped),
-            move(2, 0.25, 0.9),
+        move(2, 0.25, 0.9),
         see(State.LETTING_DOWN, "load_missing"), until(State.FAULT), clear, enable, until(State.ACTIVE), see(fault=""),
     ],
     "the motors are switched off once nothing holds the arm and it rests": [
