@@ -562,7 +562,7 @@ def test_the_page_is_german_when_its_user_or_their_browser_wants_it(page, browse
     wait_for_text(page, of_arm(".sentence"), "Ellenbogen Beugung: um 0,1° zurückdrehen.")
     texts = page.inner_text("body")
     assert not re.search(r"\b(Let down|Enable|Clear fault|Wearer|Recording)\b", texts)
-    assert "Rumpf: 11,5° nach vorn, 5,7° nach links" in texts and "Rate: 250,0 Hz. Alter der Momente: 4,1 ms." in texts
+    assert "Rumpf: 11,5° nach vorn, 5,7° nach links" in texts and "4,1 ms. Gedämpft durch: still joint (elbow)" in texts
     page.reload()
     own = browser.new_context(locale="de-AT").new_page()
     own.goto(stage.url)

@@ -277,8 +277,8 @@ export class ArmCard {
     const mass = finite(compensator?.["mass carried (kg)"]);
     write(this.find(".carried"), mass === null ? "" : t("carried", number(mass, 2)));
     const rates = bridge ? `${t("rate")}: ${number(finite(bridge["rate (Hz)"]), 1)} Hz. ${t("age")}: ${number(finite(bridge["age of efforts (ms)"]), 1)} ms.` : "";
-    const limits = bridge?.["limits acting"] ?? "none";
-    write(this.find(".rates"), limits === "none" ? rates : `${rates} ${t("limits", limits)}`);
+    const causes = [["limits", "limits acting"], ["damping", "damped by"]].filter(([, key]) => (bridge?.[key] ?? "none") !== "none");
+    write(this.find(".rates"), [rates, ...causes.map(([text, key]) => t(text, bridge[key]))].join(" "));
     write(this.find(".detail"), bridge?.message ? t("detail", bridge.message) : "");
     const silent = alive ? t("compensator_silent") : "";
     write(this.find(".compensator"), compensator?.message ? t("compensator_detail", compensator.message) : silent);
