@@ -22,29 +22,14 @@ FIELDS = ("position", "velocity", "effort")  # of a joint state
 HEADER = 4  # bytes; alignment counts from their end
 
 
-class Batch(NamedTuple):
-    """Messages in the order of their file, and where they lie in its bytes."""
+class Messages(NamedTuple):
+    """Messages of one topic in the order of their file."""
 
-    data: np.ndarray  #: (bytes,) uint8
-    start: np.ndarray  #: (n,) of each message in data
-    length: np.ndarray  #: (n,) bytes, more than those of the header
-    arrival: np.ndarray  #: (n,) ns since 1970
+    topic: str
+    msgtype: str
     ordinal: np.ndarray  #: (n,) their numbers among all messages of the recording
-
-    def of(self, chosen: np.ndarray) -> "Batch":
-        """Return the messages at the indices, or under the mask, `chosen`."""
-        return Batch(self.data, *(column[chosen] for column in self[1:]))
-
-    def messages(self) -> list[bytes]:
-        """Return each message."""
-        ends = (self.start + self.length).tolist()
-        return [self.data[start:end].tobytes() for start, end in zip(self.start.tolist(), ends, strict=True)]
-
-
-def batch_of(messages: Sequence[bytes], arrival: np.ndarray, ordinal: np.ndarray) -> Batch:
-    """Return a batch of messages that arrived at `arrival` (n,) ns; ordinal: (n,) their numbers in the recording."""
-    length = np.fromiter(map(len, messages), np.int64, len(messages))
-    return Batch(np.frombuffer(b"".join(messages), np.uint8), np.cumsum(length) - length, length, arrival, ordinal)
+    arrival: np.ndarray  #: (n,) ns since 1970, 0 where no clock shows it
+    data: Sequence[bytes]  #: (n,) each more than a header
 
 
 class Layout(NamedTuple):
@@ -123,11 +108,13 @@ class Decoder:
         self.msgtype, self.damaged, self.problem = msgtype, 0, ""
         self._known: dict[int, Layout] = {}  # the last layout by the length of its messages
 
-    def decode(self, batch: Batch) -> Iterator[tuple[np.ndarray, Layout, np.ndarray]]:
-        """Yield the messages of each layout: which of the batch they are (n,), the layout, and their numbers (n,)."""
-        for length in np.unique(batch.length).tolist():
-            left = np.flatnonzero(batch.length == length)
-            rows = records_at(batch.data, batch.start[left], length)
+    def decode(self, messages: Messages) -> Iterator[tuple[np.ndarray, Layout, np.ndarray]]:
+        """Yield the messages of each layout: which of `messages` they are (n,), the layout, and their numbers (n,)."""
+        lengths = np.array([*map(len, messages.data)])
+        for length in np.unique(lengths).tolist():
+            left = np.flatnonzero(lengths == length)
+            content = messages.data if len(left) == len(lengths) else [messages.data[n] for n in left.tolist()]
+            rows = np.frombuffer(b"".join(content), np.uint8).reshape(-1, length)
             layout = self._known.get(length)
             while len(left):
                 try:
@@ -170,9 +157,9 @@ class JointArrays(Decoder):
         # Columns grow in place: parts that are joined in the end need twice the memory.
         self._kept: dict[tuple[str, ...], list[bytearray]] = {}
 
-    def add(self, batch: Batch) -> None:
-        """Decode the messages of a batch."""
-        for rows, layout, numbers in self.decode(batch):
+    def add(self, messages: Messages) -> None:
+        """Decode messages."""
+        for rows, layout, numbers in self.decode(messages):
             names = layout.texts["name"]
             given = {field: numbers.dtype[field].shape[0] for field in FIELDS if field in (numbers.dtype.names or ())}
             if not names or len(set(names)) < len(names) or set(given.values()) - {len(names)}:
@@ -190,8 +177,9 @@ class JointArrays(Decoder):
                     if field in given:
                         values[:, number] = numbers[field]
             columns = self._kept.setdefault(names, [bytearray() for _ in JointSeries._fields])
-            for column, found in zip(columns, (batch.ordinal[rows], batch.arrival[rows], stamp, values), strict=True):
-                column += found.tobytes()
+            found = messages.ordinal[rows], messages.arrival[rows], stamp, values
+            for column, more in zip(columns, found, strict=True):
+                column += more.tobytes()
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -223,10 +211,3 @@ class JointArrays(Decoder):
             order_of_file = np.argsort(series.ordinal, kind="stable")
             series = JointSeries(*(column[order_of_file] for column in series))
         return series, others
-
-
-def records_at(data: np.ndarray, start: np.ndarray, size: int) -> np.ndarray:
-    """Return the bytes (n, size) that begin at `start` (n,) in data, (bytes,) uint8, which holds all of them."""
-    # Whole records are copied several times as fast as rows of bytes are.
-    whole = np.ndarray(max(len(data) - size + 1, 0), np.dtype((np.void, size)), data, strides=(1,))
-    return whole[start].view(np.uint8).reshape(-1, size)

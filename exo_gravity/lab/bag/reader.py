@@ -39,7 +39,7 @@ from exo_gravity.lab.bag.content import (
     arm_of,
     leaf,
 )
-from exo_gravity.lab.bag.layout import FIELDS, TYPES, Batch, Decoder, JointArrays, JointSeries
+from exo_gravity.lab.bag.layout import FIELDS, TYPES, Decoder, JointArrays, JointSeries, Messages
 from exo_gravity.lab.bag.storage import Storage
 from exo_gravity.lab.inputs.arms import recorded_of
 from exo_gravity.lab.inputs.parameter_file import recorded_parameters
@@ -96,11 +96,11 @@ class _Samples(Decoder):
         self._columns = columns
         self.parts = [(np.empty(0, np.int64), np.empty(0, np.int64), np.empty((0, width)))]
 
-    def add(self, batch: Batch) -> None:
-        for index, _, values in self.decode(batch):
+    def add(self, messages: Messages) -> None:
+        for index, _, values in self.decode(messages):
             rows = self._columns(values)
             kept = np.isfinite(rows).all(axis=1)
-            self.parts.append((batch.ordinal[index][kept], batch.arrival[index][kept], rows[kept]))
+            self.parts.append((messages.ordinal[index][kept], messages.arrival[index][kept], rows[kept]))
 
 
 class _Few:
@@ -110,9 +110,9 @@ class _Few:
         self.damaged, self.problem = 0, ""
         self._msgtype, self._take = msgtype, take
 
-    def add(self, batch: Batch) -> None:
-        rows = zip(batch.ordinal.tolist(), batch.arrival.tolist(), strict=True)
-        for row, data in zip(rows, batch.messages(), strict=True):
+    def add(self, messages: Messages) -> None:
+        rows = zip(messages.ordinal.tolist(), messages.arrival.tolist(), strict=True)
+        for row, data in zip(rows, messages.data, strict=True):
             try:
                 self._take(row, TYPES.deserialize_cdr(data, self._msgtype))
             except Exception as error:  # rosbags raises whatever its generated code raises
@@ -164,14 +164,13 @@ class _Contents:
         """Add the messages of a recording. Note what the files lack, and which messages are damaged."""
         readers: dict[str, JointArrays | _Samples | _Few] = {content.IMU: self.trunk, content.TILT_TOPIC: self.tilt}
         for rows in storage.rows(lambda topic, kind: kind in (content.READ.get(topic), content.READ.get(leaf(topic)))):
-            for number in dict.fromkeys(rows.topic.tolist()):
-                (topic, msgtype), batch = rows.topics[number], rows.batch.of(rows.topic == number)
-                if topic not in readers and msgtype == JOINT_STATE:
-                    kept = (FIELDS, self.every) if leaf(topic) == STATES else (("effort",), 1)
-                    readers[topic] = self._joints[topic] = JointArrays(topic, *kept)
-                elif topic not in readers:
-                    readers[topic] = _Few(msgtype, partial(self._add, topic))
-                readers[topic].add(batch)
+            topic, msgtype = rows.topic, rows.msgtype
+            if topic not in readers and msgtype == JOINT_STATE:
+                kept = (FIELDS, self.every) if leaf(topic) == STATES else (("effort",), 1)
+                readers[topic] = self._joints[topic] = JointArrays(topic, *kept)
+            elif topic not in readers:
+                readers[topic] = _Few(msgtype, partial(self._add, topic))
+            readers[topic].add(rows)
         self.notes += storage.notes
         self._is_cut = bool(storage.cut_short)
         if storage.cut_short:

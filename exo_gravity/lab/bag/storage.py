@@ -3,8 +3,8 @@
 
 Files are read in their own order, which shows where the clock was set: rosbags sorts messages by time. A killed
 recorder leaves neither metadata.yaml nor an index, so neither is needed. Where there is a metadata.yaml, the files that
-it names are read: others beside them are copies. mcap decodes schemas, channels and chunks, but would make an object of
-each message and each entry of an index, while seven million must be read in seconds: these are found here.
+it names are read: others beside them are copies. mcap reads the records of a file, but would make an object of each
+message in a chunk, while seven million must be read in seconds: these are found here.
 """
 
 import re
@@ -12,11 +12,11 @@ import shutil
 import sqlite3
 import struct
 import tempfile
-from collections.abc import Callable, Iterator, Mapping
+from collections import defaultdict
+from collections.abc import Callable, Iterator
 from contextlib import ExitStack, closing, suppress
 from io import BytesIO
 from pathlib import Path
-from typing import NamedTuple
 
 import numpy as np
 import yaml
@@ -28,20 +28,15 @@ from mcap.stream_reader import get_chunk_data_stream
 
 from exo_gravity.core.errors import DataError
 from exo_gravity.lab.bag.clock import LATEST
-from exo_gravity.lab.bag.layout import HEADER, Batch, batch_of, records_at
+from exo_gravity.lab.bag.layout import HEADER, Messages
 
 MAGIC = b"\x89MCAP0\r\n"
-ZSTD = 0x28  # with which data that zstd compressed begin; CDR begins with 0
+ZSTD = b"\x28"  # with which data that zstd compressed begin; CDR begins with 0
 RECORD = struct.Struct("<BQ")  # of MCAP: opcode, length of the content (https://mcap.dev/spec)
+HEAD = struct.Struct("<BQHIQQ")  # of a message: the same, channel, sequence, time, time of sending; the message follows
 MESSAGE = int(Opcode.MESSAGE)  # a plain number is faster to compare than an enumeration
-HEAD = np.dtype([  # of a message's record; the serialised message follows
-    ("opcode", "u1"), ("size", "<u8"), ("channel", "<u2"), ("sequence", "<u4"), ("time", "<u8"), ("sent", "<u8"),
-])  # fmt: skip
-LEAST = HEAD.itemsize - RECORD.size + HEADER  # bytes of a message's content; no more are damage
 LARGEST = 256 * 2**20  # bytes of an MCAP record; more is damage
-BLOCK = 2**20  # bytes of messages without a chunk at once
-ROWS = 4_000  # messages of a database at once
-ROW = int, int, bytes  # types of a message of a database
+BLOCK = 4_000  # messages at once
 TOPICS = "SELECT id, name, type FROM topics"
 MESSAGES = "SELECT topic_id, timestamp, data FROM messages WHERE topic_id IN"
 KINDS = (".mcap", ".db3")
@@ -53,14 +48,6 @@ EXPECTED = (
 
 Wanted = Callable[[str, str], bool]  # (topic, type) -> whether to yield its messages
 Topic = tuple[str, str]  # name, type
-
-
-class StoredRows(NamedTuple):
-    """Messages of several topics in the order of their file."""
-
-    topics: Mapping[int, Topic]  #: by their numbers
-    topic: np.ndarray  #: (n,) number of each message's topic
-    batch: Batch
 
 
 class Storage:
@@ -78,6 +65,7 @@ class Storage:
         self.damaged = 0
         self.notes: list[str] = []
         self._count = 0  # of the messages so far
+        self._found = defaultdict[Topic, list[tuple[int, int, bytes]]](list)  # number, time of arrival in ns, message
         check_name(path)
         if not self.path.exists():
             raise DataError(f"{path}: no such file or folder")
@@ -107,65 +95,61 @@ class Storage:
             self.notes.append(f"not read, because metadata.yaml does not name it: {', '.join(others)}")
         return kept
 
-    def rows(self, wanted: Wanted) -> Iterator[StoredRows]:
-        """Yield the messages of the `wanted` topics, file by file.
+    def rows(self, wanted: Wanted) -> Iterator[Messages]:
+        """Yield the messages of the `wanted` topics, file by file, those of a topic together.
 
         Raises DataError for a file of unknown format, and for a damaged one of which nothing can be read.
         """
         for file in self.files:
             with tempfile.TemporaryDirectory() as folder:
                 content = _decompressed(file, Path(folder)) if file.suffix.lower() in COMPRESSED else file
-                for topics, topic, batch in (self._mcap if kind_of(file) == ".mcap" else self._sqlite)(content, wanted):
-                    if np.any(batch.data[batch.start] == ZSTD):
-                        found = [_unpacked(message) for message in batch.messages()]
-                        kept = np.array([len(message) > HEADER for message in found])
-                        self.damaged += int(np.sum(~kept))
-                        messages = [message for message in found if len(message) > HEADER]
-                        topic, batch = topic[kept], batch_of(messages, batch.arrival[kept], batch.ordinal[kept])
-                    if len(topic):
-                        yield StoredRows(topics, topic, batch)
+                for _ in (self._mcap if kind_of(file) == ".mcap" else self._sqlite)(content, wanted):
+                    for topic, found in self._found.items():
+                        ordinal, arrival, messages = zip(*found, strict=True)
+                        times = np.array(arrival)
+                        known = np.where((times >= 0) & (times <= LATEST), times, 0).astype(np.int64)
+                        yield Messages(*topic, np.array(ordinal), known, messages)
+                    self._found.clear()
 
-    def _numbered(self, arrival: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return times of arrival (n,) in ns, 0 for those that no clock shows, and the messages' numbers."""
-        ordinal = np.arange(self._count, self._count + len(arrival))
-        self._count += len(arrival)
-        return np.where((arrival >= 0) & (arrival <= LATEST), arrival, 0).astype(np.int64), ordinal
+    def _take(self, topic: Topic, arrival: int, message: bytes) -> None:
+        """Add a message that arrived at `arrival` ns."""
+        self._count += 1
+        if message[:1] == ZSTD:
+            message = _unpacked(message)
+        if len(message) > HEADER:
+            self._found[topic].append((self._count, arrival, message))
+        else:
+            self.damaged += 1
 
-    def _mcap(self, file: Path, wanted: Wanted) -> Iterator[StoredRows]:
-        schemas = {0: Schema(id=0, name="", encoding="", data=b"")}
-        chosen: dict[int, Topic] = {}  # the wanted topics by channel
-        for data in self._blocks(file):
-            found, at = [], 0  # where the records of messages begin
-            try:
-                while at < len(data):
-                    opcode, length = RECORD.unpack_from(data, at)
-                    begin, at = at + RECORD.size, at + RECORD.size + length
-                    if opcode == MESSAGE and length > LEAST and at <= len(data):
-                        found.append(begin - RECORD.size)
-                    elif opcode == MESSAGE:
-                        self.damaged += 1
-                    elif opcode == Opcode.SCHEMA:
-                        schema = Schema.read(ReadDataStream(BytesIO(data[begin:at])))
-                        schemas[schema.id] = schema
-                    elif opcode == Opcode.CHANNEL:
-                        channel = Channel.read(ReadDataStream(BytesIO(data[begin:at])))
-                        schema = schemas[channel.schema_id]
-                        self.topics[channel.topic] = schema.name
-                        if wanted(channel.topic, schema.name):
-                            chosen[channel.id] = channel.topic, schema.name
-            except Exception:  # mcap raises whatever its reading meets
-                self.damaged += 1
-            if found and chosen:
-                buffer, start = np.frombuffer(data, np.uint8), np.array(found)
-                head = records_at(buffer, start, HEAD.itemsize).view(HEAD)[:, 0]
-                is_chosen = np.isin(head["channel"], [*chosen])
-                start, head = start[is_chosen] + HEAD.itemsize, head[is_chosen]
-                size = head["size"].astype(np.int64) - (HEAD.itemsize - RECORD.size)
-                yield StoredRows(chosen, head["channel"], Batch(buffer, start, size, *self._numbered(head["time"])))
+    def _mcap(self, file: Path, wanted: Wanted) -> Iterator[None]:
+        """Take the messages of an MCAP file up to the end of its data or a cut; yield after each chunk."""
+        schemas, chosen = {0: ""}, dict[int, Topic]()  # the wanted topics by channel
 
-    def _blocks(self, file: Path) -> Iterator[bytes]:
-        """Yield the records of an MCAP file, chunk by chunk, up to the end of its data, a cut or damage."""
-        loose = bytearray()  # records without a chunk
+        def take(data: bytes) -> None:
+            """Take each of the records in data, which may be a chunk of others."""
+            at = 0
+            while at < len(data):
+                opcode, length = RECORD.unpack_from(data, at)
+                begin, at = at, at + RECORD.size + length
+                if opcode == MESSAGE:
+                    _, _, channel, _, arrival, _ = HEAD.unpack_from(data, begin)
+                    if channel in chosen:
+                        self._take(chosen[channel], arrival, data[begin + HEAD.size : at])
+                    continue
+                content = ReadDataStream(BytesIO(data[begin + RECORD.size : at]))
+                if opcode == Opcode.CHUNK:
+                    stream, size = get_chunk_data_stream(Chunk.read(content), validate_crc=True)
+                    take(stream.read(size))
+                elif opcode == Opcode.SCHEMA:
+                    schema = Schema.read(content)
+                    schemas[schema.id] = schema.name
+                elif opcode == Opcode.CHANNEL:
+                    channel = Channel.read(content)
+                    topic = channel.topic, schemas[channel.schema_id]
+                    self.topics.update([topic])
+                    if wanted(*topic):
+                        chosen[channel.id] = topic
+
         with file.open("rb") as stream:
             if stream.read(len(MAGIC)) != MAGIC:
                 raise DataError(f"{file}: not an MCAP file, or empty: must be {EXPECTED}")
@@ -174,27 +158,18 @@ class Storage:
                 content = stream.read(min(length, LARGEST))
                 if len(content) < length or opcode == Opcode.DATA_END:
                     break
-                if opcode in (MESSAGE, Opcode.SCHEMA, Opcode.CHANNEL):
-                    loose += head + content
-                if opcode == Opcode.CHUNK or len(loose) > BLOCK:
-                    yield bytes(loose)
-                    loose.clear()
-                if opcode == Opcode.CHUNK:
-                    yield self._content(content)
-        yield bytes(loose)
+                try:
+                    take(head + content)
+                except Exception:  # mcap and each decompressor raise their own types
+                    self.damaged += 1
+                if opcode == Opcode.CHUNK or self._count % BLOCK == 0:
+                    yield
+        yield
         if len(head) < RECORD.size or opcode != Opcode.DATA_END:
             self.cut_short = f"{file.name} ends without an index, or is damaged"
 
-    def _content(self, chunk: bytes) -> bytes:
-        """Return the records in a chunk, none if it is damaged."""
-        try:
-            content, size = get_chunk_data_stream(Chunk.read(ReadDataStream(BytesIO(chunk))), validate_crc=True)
-            return content.read(size)
-        except Exception:  # mcap and each decompressor raise their own types
-            self.damaged += 1
-            return b""
-
-    def _sqlite(self, file: Path, wanted: Wanted) -> Iterator[StoredRows]:
+    def _sqlite(self, file: Path, wanted: Wanted) -> Iterator[None]:
+        """Take the messages of a database; yield now and then."""
         with tempfile.TemporaryDirectory() as folder, ExitStack() as stack:
             try:
                 database = stack.enter_context(closing(_opened(file, Path(folder))))
@@ -207,13 +182,13 @@ class Storage:
                 raise DataError(f"{file}: not a rosbag2 database, or damaged ({reason}): {way}") from None
             self.topics.update(topics.values())
             try:
-                while found := cursor.fetchmany(ROWS):
-                    whole = [row for row in found if tuple(map(type, row)) == ROW and len(row[2]) > HEADER]
-                    self.damaged += len(found) - len(whole)
-                    if whole:
-                        topic, arrival, messages = zip(*whole, strict=True)
-                        batch = batch_of(messages, *self._numbered(np.array(arrival)))
-                        yield StoredRows(chosen, np.array(topic), batch)
+                while rows := cursor.fetchmany(BLOCK):
+                    for topic, arrival, message in rows:
+                        if isinstance(arrival, int) and isinstance(message, bytes):
+                            self._take(chosen[topic], arrival, message)
+                        else:
+                            self.damaged += 1
+                    yield
             except sqlite3.Error:  # the rows before the damage are kept
                 self.cut_short = f"{file.name} is cut or damaged"
 
@@ -236,9 +211,9 @@ def _opened(file: Path, folder: Path) -> sqlite3.Connection:
 
 
 def _unpacked(message: bytes) -> bytes:
-    """Return a message, decompressed if rosbag2 compressed it; nothing of a damaged one."""
+    """Return a message that rosbag2 compressed; nothing of a damaged one."""
     try:
-        return zstandard.decompress(message) if message[0] == ZSTD else message
+        return zstandard.decompress(message)
     except (zstandard.ZstdError, MemoryError):
         return b""
 

@@ -94,7 +94,7 @@ def samples_of(path: Path, topic: str, msgtype: str) -> Iterator[np.ndarray]:
     """
     storage, decoder, found = Storage(path), Decoder(msgtype), False
     for rows in storage.rows(lambda name, kind: (name, kind) == (topic, msgtype)):
-        for _, _, values in decoder.decode(rows.batch):
+        for _, _, values in decoder.decode(rows):
             yield values
             found = True
     if not found:

@@ -26,7 +26,7 @@ from rosbags.rosbag2 import CompressionMode, StoragePlugin
 
 from exo_gravity.core.errors import DataError
 from exo_gravity.lab.bag.content import NodeStatus
-from exo_gravity.lab.bag.layout import Decoder, batch_of
+from exo_gravity.lab.bag.layout import Decoder, Messages
 from exo_gravity.lab.bag.reader import read_bag
 from exo_gravity.lab.report.trial_report import analyse
 from exo_gravity.lab.trial.recording import ARRAYS, in_blocks
@@ -565,7 +565,7 @@ def test_numbers_and_texts_are_those_that_rosbags_decodes_and_a_damaged_message_
     ]
     messages = [messages[n] for n in rng.integers(60, size=200)]
     messages[7] = messages[7][:30]
-    for index, layout, values in decoder.decode(batch_of(messages, *[np.arange(200)] * 2)):
+    for index, layout, values in decoder.decode(Messages("", kind, *[np.arange(200)] * 2, messages)):
         found |= {at: (layout.texts, row) for at, row in zip(index.tolist(), values, strict=True)}
     assert sorted(found) == [n for n in range(200) if n != 7] and decoder.damaged == 1
     for at, (texts, row) in found.items():
