@@ -12,26 +12,61 @@ import socket
 import subprocess
 import threading
 import time
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor, wait
+from enum import IntEnum
+from importlib import import_module, metadata
 from multiprocessing import get_context
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
+from can.interfaces import BACKENDS
+from rich.console import Console
+from rich.progress import track
 
-from exo_gravity.core.errors import named
+from exo_gravity.core.errors import BusError, named
 from exo_gravity.core.motors.joint_motor import REPLY_SHARE, SIMULATED_BUSES, Traffic, motors_of, traffic_of
 from exo_gravity.core.safety.limits import CAN_BRIDGE, limits_of
+from exo_gravity.hardware.bus_lock import borrowed
 from exo_gravity.hardware.can_port import ArmOnBus, serials_of
-from exo_gravity.hardware.clock import raise_priority, request_real_time
-from exo_gravity.hardware.network import MIDDLEWARE, check_environment, open_to_others, restrict_to_localhost
-from exo_gravity.lab.adapters import of_opening
-from exo_gravity.lab.findings import Finding, Level, judged
+from exo_gravity.hardware.clock import favour, request_real_time
+from exo_gravity.hardware.network import MIDDLEWARE, check_environment, keep_to_this_machine, open_to_others
 from exo_gravity.lab.inputs.arms import node_values
 from exo_gravity.lab.inputs.node_checks import check_nodes
 from exo_gravity.lab.inputs.parameter_file import Nodes, can_options, stages
 from exo_gravity.lab.packages import MissingPackageError, check_packages
+
+
+class Level(IntEnum):
+    """How bad a finding is."""
+
+    FINE = 0
+    UNKNOWN = 1  #: the computer does not state it, or it could not be tried
+    NOTE = 2  #: could be better, without an effect that was seen
+    WARNING = 3
+    FAULT = 4  #: no one may wear an arm that this computer controls
+
+
+STYLES = {Level.FINE: "green", Level.UNKNOWN: "dim", Level.NOTE: "", Level.WARNING: "yellow", Level.FAULT: "bold red"}
+
+
+class Finding(NamedTuple):
+    """One row. remedy: the command that fixes it, '' for none."""
+
+    what: str
+    found: str
+    wanted: str
+    level: Level = Level.FINE
+    remedy: str = ""
+
+
+def judged(what: str, found: str, wanted: str, is_fine: bool, otherwise: Level, remedy: str) -> Finding:
+    """Return a finding: FINE or `otherwise`; UNKNOWN where nothing was found."""
+    if not found:
+        return Finding(what, "not stated", wanted, Level.UNKNOWN)
+    return Finding(what, found, wanted) if is_fine else Finding(what, found, wanted, otherwise, remedy)
+
 
 LATE = 0.001  # share of cycles that may be late by half a period, as in docs/performance.md
 SLOW_WAKE = 0.1  # of a period, for which a CPU may wake from its deepest idle state
@@ -71,8 +106,6 @@ def _text(path: Path) -> str:
 
 def measured(period: float, seconds: float, priority: int) -> Wakeups:
     """Run `measure` in a separate process, show its progress, and return its result."""
-    from rich.progress import track
-
     with ProcessPoolExecutor(1, get_context("spawn")) as pool:
         wakeups = pool.submit(measure, period, seconds, priority)
         for _ in track(range(100), f"Wake-ups at {1.0 / period:g} Hz", transient=True):
@@ -300,3 +333,53 @@ def examine(nodes: Nodes, seconds: float, root: Path) -> list[Finding]:
         *of_nodes(nodes, bridges),
         *buses,
     ]
+
+
+def of_opening(name: str, bus: ArmOnBus) -> Finding:
+    """Import python-can's backend of a bus, and open the bus for a moment, without a frame, unless a bridge holds it.
+
+    name: of the bridge. bus: the part of its arm on this bus.
+    """
+    interface, channel, _ = bus.address
+    what, wanted = f"{name} {channel}: opens", f"yes, with {interface}"
+    if interface not in BACKENDS:
+        others = f"can.interface: one of {', '.join(sorted(BACKENDS))}"
+        return Finding(what, f"python-can has no interface {interface}", wanted, Level.FAULT, others)
+    try:
+        import_module(BACKENDS[interface][0])
+    except Exception as error:  # drivers of makers raise errors of every type
+        return Finding(what, f"no driver: {_one_line(error)}", wanted, Level.FAULT, _driver(interface))
+    with borrowed(bus.address) as holder:
+        if holder:
+            return Finding(what, f"not tried: held by {holder}", wanted, Level.UNKNOWN)
+        try:
+            bus.open(bus.address).shutdown()
+        except BusError as error:
+            reason = _one_line(error.__cause__ or error)
+            return Finding(what, reason, wanted, Level.FAULT, f"plug the adapter in; {_driver(interface)}")
+    return Finding(what, "yes", wanted)
+
+
+def _one_line(error: BaseException) -> str:
+    return " ".join(f"{error}".split()) or type(error).__name__
+
+
+def _driver(interface: str) -> str:
+    """Return what installs the driver of a python-can interface, as python-can's own metadata names it."""
+    extras = {extra.replace("-", "_") for extra in metadata.metadata("python-can").get_all("Provides-Extra") or ()}
+    if interface in extras:
+        return f"pip install 'python-can[{interface}]'"
+    return f"install the driver of {interface}: https://python-can.readthedocs.io/en/stable/interfaces.html"
+
+
+def show(findings: Sequence[Finding], console: Console) -> None:
+    """Print each finding, and below it the command that fixes it, unwrapped."""
+    heading = Finding("what", "found", "wanted")
+    rows = (heading, *findings)
+    what, found = max(len(row.what) for row in rows), max(len(row.found) for row in rows)
+    for row in rows:
+        level, style = ("", "bold") if row is heading else (row.level.name.lower(), STYLES[row.level])
+        line = f"{level:<7}  {row.what:<{what}}  {row.found:<{found}}  {row.wanted}"
+        console.print(line, style=style, markup=False, soft_wrap=True)
+        if row.remedy:
+            console.print(f"{'':<7}  -> {row.remedy}", markup=False, highlight=False, soft_wrap=True)

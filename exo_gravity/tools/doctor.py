@@ -11,30 +11,10 @@ Exit code 0: fine. 1: warnings. 2: no one may wear an arm that this computer con
 import argparse
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 from exo_gravity import require_ros
-from exo_gravity.lab.findings import Finding, Level
 from exo_gravity.lab.inputs.parameter_file import load, packaged_config
 from exo_gravity.tools.cli import exit_code, extras, non_negative
-
-if TYPE_CHECKING:
-    from rich.console import Console
-
-STYLES = {Level.FINE: "green", Level.UNKNOWN: "dim", Level.NOTE: "", Level.WARNING: "yellow", Level.FAULT: "bold red"}
-
-
-def show(findings: Sequence[Finding], console: "Console") -> None:
-    """Print each finding, and below it the command that fixes it, unwrapped."""
-    heading = Finding("what", "found", "wanted")
-    rows = (heading, *findings)
-    what, found = max(len(row.what) for row in rows), max(len(row.found) for row in rows)
-    for row in rows:
-        level, style = ("", "bold") if row is heading else (row.level.name.lower(), STYLES[row.level])
-        line = f"{level:<7}  {row.what:<{what}}  {row.found:<{found}}  {row.wanted}"
-        console.print(line, style=style, markup=False, soft_wrap=True)
-        if row.remedy:
-            console.print(f"{'':<7}  -> {row.remedy}", markup=False, highlight=False, soft_wrap=True)
 
 
 def _arguments(args: Sequence[str] | None) -> argparse.Namespace:
@@ -59,7 +39,7 @@ def _run(options: argparse.Namespace, root: Path) -> int:
     from rich.console import Console
 
     with extras("doctor", "ros"):
-        from exo_gravity.lab.computer import examine
+        from exo_gravity.lab.computer import Level, examine, show
     findings = examine(load(options.params or packaged_config("sim.yaml")), options.seconds, root)
     show(findings, Console(highlight=False))
     warnings, faults, unknown = (
