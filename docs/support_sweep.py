@@ -18,8 +18,8 @@ from exo_gravity.core.motors.families import MOTORS
 from exo_gravity.core.motors.joint_motor import JointMotor
 from exo_gravity.core.safety.limits import Limits
 from exo_gravity.lab.report.html import HOLD_COLOUR, INK, JOINT_COLOURS, make_plain
+from exo_gravity.lab.trial.analysis import Recording
 from exo_gravity.lab.trial.offline import ArmSetup, OfflineTrial
-from exo_gravity.lab.trial.recording import Recording
 from exo_gravity.sim import ArmConfig, SimulatedArm, SimulatedDevice, SimulatedMotor
 from exo_gravity.sim.script import TrialScript
 from exo_gravity.sim.virtual_arm import resting

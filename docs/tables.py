@@ -28,7 +28,7 @@ from exo_gravity.core.safety.limits import CAN_BRIDGE
 from exo_gravity.core.trunk.params import IMU
 from exo_gravity.lab.bag.content import RECORDER
 from exo_gravity.lab.view import ROBOT_MODEL
-from exo_gravity.panel.view import PANEL
+from exo_gravity.panel.control import PANEL
 from exo_gravity.sim.params import SIMULATOR
 
 DOCS = Path(__file__).parent

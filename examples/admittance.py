@@ -39,7 +39,7 @@ from exo_gravity.core.safety.command import State
 from exo_gravity.core.safety.limits import Limits
 from exo_gravity.lab.inputs.arms import read_arm
 from exo_gravity.lab.inputs.parameter_file import load
-from exo_gravity.lab.observer.momentum import MomentumObserver
+from exo_gravity.lab.observer import MomentumObserver
 from exo_gravity.sim import ArmConfig, SimulatedArm, SimulatedDevice, SimulatedMotor, VirtualWearer
 from exo_gravity.sim.controllers import DirectController
 from exo_gravity.sim.script import TrialScript

@@ -8,11 +8,10 @@ from functools import partial
 from exo_gravity.core.arm.interface import Payload
 from exo_gravity.core.safety.command import State
 from exo_gravity.sim import SimulatedDevice
-from exo_gravity.sim.events import ACTS as SHARED
-from exo_gravity.sim.events import imu_wrong, payload_dropped
 from exo_gravity.sim.judge import Driven, driven
 from exo_gravity.sim.motors import simulated
-from exo_gravity.sim.rig import IMU_PERIOD, Act, Change, Rig
+from exo_gravity.sim.rig import ACTS as SHARED
+from exo_gravity.sim.rig import IMU_PERIOD, Act, Change, Rig, imu_wrong, payload_dropped
 
 from ..arms import ARMS, Friction
 from .case import BODY_MASS, CARRIED, Bound, Case, bound_of, draw

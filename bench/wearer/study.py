@@ -25,12 +25,11 @@ from exo_gravity.core.compensation.settings import Settings
 from exo_gravity.core.errors import DataError
 from exo_gravity.core.numbers import NO_TORQUE, Torque
 from exo_gravity.core.safety.limits import Limits
-from exo_gravity.lab.observer.share import Share, WearerCurve, observed, share_of
+from exo_gravity.lab.observer import Share, WearerCurve, observed, share_of
 from exo_gravity.lab.trial.offline import ArmSetup, OfflineTrial
 from exo_gravity.sim import STEP, SimulatedImu, VirtualWearer
-from exo_gravity.sim.imu import ImuConfig
 from exo_gravity.sim.script import TrialScript
-from exo_gravity.sim.trunk_motion import TrunkState
+from exo_gravity.sim.trunk_motion import ImuConfig, TrunkState
 from exo_gravity.sim.virtual_arm import TrunkReading
 from exo_gravity.sim.virtual_wearer import path_between
 

@@ -30,8 +30,8 @@ from exo_gravity.core.motors.joint_motor import REPLY_SHARE, SIMULATED_BUSES, Tr
 from exo_gravity.core.safety.limits import CAN_BRIDGE, limits_of
 from exo_gravity.hardware.bus_lock import borrowed
 from exo_gravity.hardware.can_port import ArmOnBus, serials_of
-from exo_gravity.hardware.clock import favour, request_real_time
-from exo_gravity.hardware.network import MIDDLEWARE, check_environment, keep_to_this_machine, open_to_others
+from exo_gravity.hardware.clock import raise_priority, request_real_time
+from exo_gravity.hardware.network import MIDDLEWARE, check_environment, open_to_others, restrict_to_localhost
 from exo_gravity.lab.inputs.arms import node_values
 from exo_gravity.lab.inputs.node_checks import check_nodes
 from exo_gravity.lab.inputs.parameter_file import Nodes, can_options, stages

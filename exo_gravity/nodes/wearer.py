@@ -37,8 +37,7 @@ from exo_gravity.core.vocabulary import NO_REASON, NONE, UNKNOWN, Reason
 from exo_gravity.hardware.urdf_arm import UrdfArm, arm_from, read_urdf
 from exo_gravity.lab.budget import USUAL_TILT, budget, largest_support, motor_torques, overload, workspace
 from exo_gravity.lab.inputs.arms import fitting
-from exo_gravity.lab.observer.share import PERIOD
-from exo_gravity.lab.observer.watch import WearerWatch, values_of
+from exo_gravity.lab.observer import PERIOD, WearerWatch, values_of
 from exo_gravity.lab.vocabulary import Adapts, Budget, NoEstimate, WearerState
 from exo_gravity.nodes.others import NodeParameters, Statuses
 from exo_gravity.nodes.ros.messages import OK, STALE, WARN, Diagnostics, by_name

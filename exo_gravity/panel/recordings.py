@@ -28,7 +28,7 @@ from exo_gravity.core.safety.command import State
 from exo_gravity.lab.inputs.ros_yaml import dumped, text_of
 from exo_gravity.lab.processes import Launcher, program
 from exo_gravity.lab.trial.session import Session, check_text
-from exo_gravity.panel.view import OF_SUBJECT
+from exo_gravity.panel.control import OF_SUBJECT
 from exo_gravity.sim.script import TrialScript
 
 RECORDER, WEARER, REPORT = "/recorder", "wearer.yaml", "report.html"

@@ -14,9 +14,8 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from exo_gravity.sim.arm import STEP, ArmConfig, SimulatedArm
     from exo_gravity.sim.device import SimulatedDevice
-    from exo_gravity.sim.imu import ImuConfig, SimulatedImu
-    from exo_gravity.sim.motors.ak import SimulatedMotor
-    from exo_gravity.sim.motors.firmware import FIRMWARES, Firmware
+    from exo_gravity.sim.motors.ak import FIRMWARES, Firmware, SimulatedMotor
+    from exo_gravity.sim.trunk_motion import ImuConfig, SimulatedImu
     from exo_gravity.sim.virtual_wearer import VirtualWearer
 
 __all__ = [
@@ -34,9 +33,8 @@ __all__ = [
 MODULES = {
     "arm": ("STEP", "ArmConfig", "SimulatedArm"),
     "device": ("SimulatedDevice",),
-    "imu": ("ImuConfig", "SimulatedImu"),
-    "motors.ak": ("SimulatedMotor",),
-    "motors.firmware": ("FIRMWARES", "Firmware"),
+    "motors.ak": ("FIRMWARES", "Firmware", "SimulatedMotor"),
+    "trunk_motion": ("ImuConfig", "SimulatedImu"),
     "virtual_wearer": ("VirtualWearer",),
 }
 

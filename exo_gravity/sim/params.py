@@ -16,10 +16,9 @@ from exo_gravity.core.params import Param, param_of, params_of, table_for
 from exo_gravity.hardware.urdf_arm import read_urdf
 from exo_gravity.sim.arm import DEFAULT_LINKS, ArmConfig, JointConfig, SimulatedArm
 from exo_gravity.sim.device import SimulatedDevice
-from exo_gravity.sim.imu import ImuConfig
 from exo_gravity.sim.motors import class_of, simulated
-from exo_gravity.sim.motors.ak import Heat
-from exo_gravity.sim.motors.firmware import FIRMWARES, Firmware
+from exo_gravity.sim.motors.ak import FIRMWARES, Firmware, Heat
+from exo_gravity.sim.trunk_motion import ImuConfig
 from exo_gravity.sim.truth import TruthLog
 from exo_gravity.sim.urdf import UrdfConfig
 
@@ -56,7 +55,7 @@ FIRMWARE = (
     Param(
         "firmware.variant",
         [USUAL] * JOINT_COUNT,
-        "what the boards' firmware does (sim/motors/firmware.py); usual: ak, v3, or that of the motor's family",
+        "what the boards' firmware does (sim/motors/ak.py); usual: ak, v3, or that of the motor's family",
         choices=(USUAL, *FIRMWARES),
         fixed=True,
     ),

@@ -1,9 +1,10 @@
 # Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
 """One arm in virtual time with its compensator and an IMU, and everything that can go wrong with them.
 
-Tests and studies play it: `events` has what can happen, and `judge` says what the motors did by the arm's true motion.
+Tests and studies play it: `ACTS` has what can happen, and `judge` says what the motors did by the arm's true motion.
 """
 
+import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
@@ -11,12 +12,13 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from exo_gravity.core.arm.interface import Payload
 from exo_gravity.core.arm.tilt import gravity_in_trunk
 from exo_gravity.core.compensation.compensator import Compensator
 from exo_gravity.core.compensation.settings import Settings
-from exo_gravity.core.motors.frames import Frame
+from exo_gravity.core.motors.frames import ID_BITS, Frame
 from exo_gravity.core.motors.joint_motor import JointMotor
-from exo_gravity.core.safety.command import State
+from exo_gravity.core.safety.command import Efforts, State
 from exo_gravity.core.safety.limits import Limits
 from exo_gravity.hardware.can_port import message_of
 from exo_gravity.sim.controllers import DirectController, UnreliableController
@@ -172,3 +174,245 @@ class Rig(VirtualArm):
 
 def _call(function: Callable[[float], object], clock: Callable[[], float]) -> None:
     function(clock())
+
+
+RAMP_STEPS = 20  # in which an IMU's error grows, or a motor warms
+WARMING = 4.0  # s
+
+
+def during(rig: Rig, duration: float, begin: Callable[[], None], end: Callable[[], None]) -> None:
+    """Call `begin` now and `end` in `duration` s, never if that is infinite."""
+    begin()
+    if math.isfinite(duration):
+        rig.clock.later(duration, end)
+
+
+def setting(rig: Rig, owner: object, name: str, value: object, normal: object, duration: float) -> None:
+    """Give an attribute a value for `duration` s."""
+    rig.catch_up()
+    during(rig, duration, partial(setattr, owner, name, value), partial(setattr, owner, name, normal))
+
+
+def gradually(rig: Rig, duration: float, step: Callable[[float], None]) -> None:
+    """Call step(share) with a share that grows to 1 within `duration` s."""
+    for number in range(1, RAMP_STEPS + 1):
+        share = number / RAMP_STEPS
+        rig.clock.later(share * duration, partial(step, share))
+
+
+def request(name: str, then: str = "") -> Act:
+    """Return the act that asks the safety machine for something, and, `duration` s later, for something else."""
+
+    def inject(rig: Rig, duration: float = 0.0) -> None:
+        rig.between_cycles(getattr(rig.safety, name))
+        if then:
+            rig.clock.later(duration, partial(rig.between_cycles, getattr(rig.safety, then)))
+
+    return inject
+
+
+def max_effort(rig: Rig, share: float) -> None:
+    """Lower every effort limit to a share of what it is."""
+    rig.change(max_effort=tuple(share * most for most in rig.settings.max_effort))
+
+
+def mode(rig: Rig) -> None:
+    """Change from zero-G to one-G, or back."""
+    rig.change(mode="one_g" if rig.settings.mode == "zero_g" else "zero_g")
+
+
+def supply_cut(rig: Rig, motors: Sequence[int], duration: float = math.inf) -> None:
+    """Cut the supply. After it the encoders, on the rotors, know the angle only within a turn of the rotor."""
+
+    def power(is_on: bool) -> None:
+        rig.catch_up()
+        errors = list(rig.device.encoder_error)
+        for joint in motors:
+            motor = rig.motors[joint]
+            motor.unplugged = not is_on
+            turn = 2.0 * math.pi / motor.joint.spec.gear_ratio
+            errors[joint] = -turn * round(rig.device.arm.positions[joint] / turn)
+        rig.device.encoder_error = errors
+
+    during(rig, duration, partial(power, False), partial(power, True))
+
+
+def unplugged(rig: Rig, joint: int, duration: float = math.inf) -> None:
+    """Take the power of one motor away, to the millisecond; it comes back switched off."""
+    rig.catch_up()
+    rig.device.unplug(joint, duration)
+
+
+def frames_lost(which: str, ends: str) -> Act:
+    """Return the act that loses the frames of some motors: of the wire's set `which`, by the IDs named `ends`."""
+
+    def inject(rig: Rig, motors: Sequence[int], duration: float = math.inf) -> None:
+        ids = {getattr(rig.motors[joint].joint, ends) & ID_BITS for joint in motors}
+        lost: set[int] = getattr(rig.wire, which)
+        during(rig, duration, partial(lost.update, ids), partial(lost.difference_update, ids))
+
+    return inject
+
+
+def motors_fail(name: str) -> Act:
+    """Return the act that sets a flag of the device for some motors, and clears that of all after a time."""
+
+    def inject(rig: Rig, motors: Sequence[int], duration: float = math.inf) -> None:
+        normal = [False] * len(rig.motors)
+        setting(rig, rig.device, name, [joint in motors for joint in range(len(normal))], normal, duration)
+
+    return inject
+
+
+def encoder_slip(rig: Rig, joint: int, error: float) -> None:
+    """Add `error` rad to what the encoder of a joint reads."""
+    rig.catch_up()
+    rig.device.encoder_error = errors = list(rig.device.encoder_error)
+    errors[joint] += error
+
+
+def attribute(owner: str, name: str, value: object, normal: object) -> Act:
+    """Return the act that gives an attribute of the rig's device or controller a value for a time."""
+
+    def inject(rig: Rig, duration: float = math.inf) -> None:
+        setting(rig, getattr(rig, owner), name, value, normal, duration)
+
+    return inject
+
+
+def of_motor(name: str, normal: object) -> Act:
+    """Return the act that gives a motor's attribute a value for a time."""
+
+    def inject(rig: Rig, joint: int, value: object, duration: float = math.inf) -> None:
+        setting(rig, rig.motors[joint], name, value, normal, duration)
+
+    return inject
+
+
+def motor_warms(rig: Rig, joint: int, most: float) -> None:
+    """Warm a motor from 60 to `most` degC."""
+    motor = rig.motors[joint]
+    gradually(rig, WARMING, lambda share: setattr(motor, "temperature", 60.0 + share * (most - 60.0)))
+
+
+def foreign_torque(rig: Rig, joint: int, torque: float, rate: float = 500.0, duration: float = 2.0) -> None:
+    """Command a motor as another host would: `torque` Nm, `rate` times a second for `duration` s."""
+    motor = rig.motors[joint].joint
+    for number in range(1 + int(rate * duration)):
+        rig.clock.later(number / rate, partial(rig.send, (motor.command_id, motor.command(torque, 0.0))))
+
+
+def withdrawn(answer: Efforts) -> Efforts:
+    """Return no efforts."""
+    return answer._replace(effort=None)
+
+
+def not_a_number(answer: Efforts) -> Efforts:
+    """Return efforts of which the first one is NaN."""
+    return answer._replace(effort=(math.nan, *answer.effort[1:])) if answer.effort else answer
+
+
+def efforts_late(rig: Rig, duration: float, most: float = 0.3) -> None:
+    """Delay the compensator's efforts by `duration` s or `most`, for `duration` s."""
+    setting(rig, rig.controller, "delay", min(most, duration), 0.0, duration)
+
+
+def reach(rig: Rig, pose: Sequence[float], duration: float) -> None:
+    """Let the wearer move their arm to a pose (n,) rad within `duration` s."""
+    rig.act({"move": list(pose), "over": duration})
+
+
+def resist(rig: Rig, duration: float) -> None:
+    """Let the wearer hold their arm where it is for `duration` s."""
+    rig.catch_up()
+    reach(rig, rig.device.arm.positions, duration)
+
+
+def trunk(action: str) -> Act:
+    """Return the act that turns the trunk by an angle in rad within `duration` s: 'bow' or 'lean'."""
+
+    def inject(rig: Rig, duration: float, **angle: float) -> None:
+        rig.act({action: angle[action], "over": duration}, {"hold": HOLD})
+
+    return inject
+
+
+def payload_taken(rig: Rig, mass: float, told: float) -> None:
+    """Let the wearer pick up `mass` kg; the operator sets the payload to `told` times that mass."""
+    rig.catch_up()
+    rig.device.arm.carry(mass)
+    rig.change(payload=Payload(told * mass))
+
+
+def payload_dropped(rig: Rig) -> None:
+    """Let the wearer drop what they carry."""
+    rig.catch_up()
+    rig.device.arm.carry(0.0)
+
+
+def out_of_cuff(rig: Rig) -> None:
+    """Let the wearer pull their arm out of the exoskeleton."""
+    payload_dropped(rig)
+    arm = rig.device.arm
+    arm.config = replace(arm.config, wearer_mass=(0.0,) * len(arm.config.wearer_mass))
+    arm.carry(0.0)
+
+
+def imu_wrong(rig: Rig, pitch: float, roll: float, duration: float) -> None:
+    """Let the IMU's error grow to `pitch` and `roll` rad within `duration` s."""
+    gradually(rig, duration, lambda share: setattr(rig, "imu_error", [share * pitch, share * roll]))
+
+
+def imu_frozen(rig: Rig, duration: float = math.inf) -> None:
+    """Repeat the IMU's newest reading."""
+    setting(rig, rig, "imu_frozen", rig.newest_reading, None, duration)
+
+
+ACTS: Mapping[str, Act] = {
+    # The operator. `toggle` and `rearm` enable the arm `duration` s later.
+    "disable": request("disable"),
+    "enable": request("enable"),
+    "clear": request("clear"),
+    "resume": request("resume"),
+    "toggle": request("disable", then="enable"),
+    "rearm": request("clear", then="enable"),
+    "settings": lambda rig, **changes: rig.change(**changes),
+    "mode": mode,
+    "max_effort": max_effort,
+    # Hardware. `commands_lost` and `replies_lost` are lost on the bus; a motor that is `mute` sends none.
+    "supply_cut": supply_cut,
+    "unplugged": unplugged,
+    "commands_lost": frames_lost("commands_lost", "command_id"),
+    "replies_lost": frames_lost("replies_lost", "reply_id"),
+    "cut_off": motors_fail("cut_off"),
+    "mute": motors_fail("mute"),
+    "bus_silent": attribute("device", "bus_silent", True, False),
+    "encoder_slip": encoder_slip,
+    "encoder_jump": lambda rig, joint: encoder_slip(rig, joint, rig.motors[joint].joint.spec.rotor_turn),
+    "wrong_speed": lambda rig, joint, factor, duration: of_motor("speed_factor", 1.0)(rig, joint, factor, duration),
+    "torque_reversed": lambda rig, joint: of_motor("is_reversed", False)(rig, joint, True),
+    "motor_error": lambda rig, joint, code: of_motor("error", 0)(rig, joint, code),
+    "motor_hot": of_motor("temperature", 30.0),
+    "motor_warms": motor_warms,
+    "foreign_torque": foreign_torque,
+    # Computers.
+    "stall": lambda rig, duration: setattr(rig.controller, "stall", duration),
+    "efforts_late": efforts_late,
+    "efforts_withdrawn": attribute("controller", "change", withdrawn, None),
+    "efforts_nan": attribute("controller", "change", not_a_number, None),
+    # The wearer.
+    "wearer": lambda rig, steps: rig.act(*steps),  # of a trial script
+    "reach": reach,
+    "limp": lambda rig: rig.act(),
+    "resist": resist,
+    "push": lambda rig, torque, duration: rig.act({"push": list(torque), "over": duration}),  # (n,) Nm
+    "payload_taken": payload_taken,
+    "payload_dropped": payload_dropped,
+    "out_of_cuff": out_of_cuff,
+    "bow": trunk("bow"),
+    "lean": trunk("lean"),
+    # The IMU.
+    "imu_wrong": imu_wrong,
+    "imu_frozen": imu_frozen,
+    "imu_silent": lambda rig, duration=math.inf: setting(rig, rig, "imu_silent", True, False, duration),
+}

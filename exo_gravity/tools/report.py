@@ -21,8 +21,8 @@ from exo_gravity.core.errors import ParameterError
 from exo_gravity.core.vocabulary import Source
 from exo_gravity.lab.bag.content import Bag
 from exo_gravity.lab.report import html, video
-from exo_gravity.lab.source import of_all
 from exo_gravity.lab.trial.analysis import MIN_HOLD, HoldCriteria
+from exo_gravity.lab.vocabulary import of_all
 from exo_gravity.tools.cli import exit_code, extras, non_negative, positive
 
 

@@ -16,7 +16,7 @@ from exo_gravity.core.compensation.settings import COMPENSATOR, Settings, compen
 from exo_gravity.core.numbers import NO_TORQUE
 from exo_gravity.core.params import values_of
 from exo_gravity.hardware.urdf_arm import UrdfArm
-from exo_gravity.lab.observer.momentum import MomentumObserver
+from exo_gravity.lab.observer import MomentumObserver
 from exo_gravity.sim import ArmConfig, SimulatedArm
 from exo_gravity.sim.arm import DEFAULT_LINKS
 from exo_gravity.sim.urdf import UrdfConfig

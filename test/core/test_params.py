@@ -46,12 +46,12 @@ from exo_gravity.lab.bag.content import RECORDER
 from exo_gravity.lab.calibration.moment_model import MomentModel
 from exo_gravity.lab.calibration.tour import CALIBRATOR
 from exo_gravity.lab.view import ROBOT_MODEL
-from exo_gravity.panel.view import PANEL
+from exo_gravity.panel.control import PANEL
 from exo_gravity.sim import ArmConfig
 from exo_gravity.sim.arm import DEFAULT_LINKS
-from exo_gravity.sim.imu import ImuConfig
 from exo_gravity.sim.params import SIMULATOR
 from exo_gravity.sim.script import TrialScript
+from exo_gravity.sim.trunk_motion import ImuConfig
 from exo_gravity.sim.virtual_time import Wire
 
 from ..support import ROBOT

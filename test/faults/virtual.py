@@ -18,9 +18,8 @@ from exo_gravity.core.safety.lease import Lease
 from exo_gravity.lab.inputs.arms import node_values, read_arm
 from exo_gravity.lab.inputs.parameter_file import Nodes, load
 from exo_gravity.sim.device import SimulatedDevice
-from exo_gravity.sim.events import ACTS, HOLD
 from exo_gravity.sim.params import device_of, simulator_table
-from exo_gravity.sim.rig import Rig
+from exo_gravity.sim.rig import ACTS, HOLD, Rig
 
 from ..support import CONFIG
 from ..support.copies import copied

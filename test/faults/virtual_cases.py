@@ -15,9 +15,8 @@ from exo_gravity.core.motors.frames import SET_ZERO
 from exo_gravity.core.safety.command import State
 from exo_gravity.core.safety.limits import CONFIRM
 from exo_gravity.lab.inputs.parameter_file import load
-from exo_gravity.sim.events import ACTS
 from exo_gravity.sim.judge import USUAL, resolution
-from exo_gravity.sim.rig import IMU_PERIOD
+from exo_gravity.sim.rig import ACTS, IMU_PERIOD
 from exo_gravity.sim.virtual_arm import TrunkReading
 
 from ..support import CONFIG

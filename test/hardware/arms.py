@@ -29,8 +29,7 @@ from exo_gravity.hardware.motor_bus import MotorBus
 from exo_gravity.sim import ArmConfig, SimulatedMotor
 from exo_gravity.sim.arm import DEFAULT_LINKS, SimulatedArm
 from exo_gravity.sim.device import SimulatedDevice
-from exo_gravity.sim.events import ACTS
-from exo_gravity.sim.rig import Rig
+from exo_gravity.sim.rig import ACTS, Rig
 from exo_gravity.sim.truth import TruthRecords
 from exo_gravity.sim.virtual_time import Wire
 

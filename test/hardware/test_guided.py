@@ -20,7 +20,7 @@ from exo_gravity.core.safety.command import State
 from exo_gravity.core.safety.explain import MOTION
 from exo_gravity.sim import VirtualWearer
 from exo_gravity.sim.arm import DEFAULT_LINKS
-from exo_gravity.sim.events import ACTS
+from exo_gravity.sim.rig import ACTS
 from exo_gravity.sim.script import TrialScript
 
 from ..support import PARTS

@@ -18,9 +18,8 @@ from exo_gravity.core.arm.interface import STANDARD_GRAVITY as G
 from exo_gravity.core.arm.tilt import gravity_in_trunk
 from exo_gravity.core.errors import ParameterError
 from exo_gravity.hardware.trunk_estimator import TUNING, ImuSample, TrunkEstimator
-from exo_gravity.sim.imu import ImuConfig, SimulatedImu
 from exo_gravity.sim.script import Step
-from exo_gravity.sim.trunk_motion import TrunkState, motion_of
+from exo_gravity.sim.trunk_motion import ImuConfig, SimulatedImu, TrunkState, motion_of
 
 from ..support.imu_motion import (
     RECORDED,

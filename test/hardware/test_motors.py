@@ -29,12 +29,11 @@ from exo_gravity.core.safety.command import FaultCode, State
 from exo_gravity.lab.inputs.arms import node_values, read_arm
 from exo_gravity.lab.inputs.parameter_file import load, packaged_config
 from exo_gravity.sim.device import SimulatedDevice
-from exo_gravity.sim.events import ACTS
 from exo_gravity.sim.motors import simulated
-from exo_gravity.sim.motors.ak import SimulatedMotor
+from exo_gravity.sim.motors.ak import FIRMWARES, Firmware, SimulatedMotor
 from exo_gravity.sim.motors.damiao import DamiaoMotor
-from exo_gravity.sim.motors.firmware import FIRMWARES, Firmware
 from exo_gravity.sim.params import device_of, simulator_table
+from exo_gravity.sim.rig import ACTS
 
 from ..support.copies import prepared
 from ..support.simulated_device import joints_of

@@ -34,7 +34,7 @@ from exo_gravity.hardware.bus_lock import (
     notes_file,
 )
 from exo_gravity.hardware.owned_bus import ArmLock, OwnedBus, let_down, take_over
-from exo_gravity.sim.events import ACTS
+from exo_gravity.sim.rig import ACTS
 from exo_gravity.sim.virtual_time import VirtualBus, VirtualClock
 
 from ..support.copies import copied

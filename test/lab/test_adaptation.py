@@ -8,8 +8,7 @@ from typing import Any
 import pytest
 
 from exo_gravity.core.compensation.support import REQUEST
-from exo_gravity.lab.observer.adaptation import ADAPTATION, SupportAdaptation
-from exo_gravity.lab.observer.momentum import WearerEstimate
+from exo_gravity.lab.observer import ADAPTATION, SupportAdaptation, WearerEstimate
 
 from ..core.test_compensator import SETTINGS
 

@@ -17,10 +17,10 @@ from exo_gravity.core.vocabulary import Source
 from exo_gravity.lab.inputs.arms import configured_arms, read_arm
 from exo_gravity.lab.inputs.parameter_file import load, packaged_config
 from exo_gravity.lab.parallel import ENDED, Outcome, in_processes
-from exo_gravity.lab.source import of_all, source_of
 from exo_gravity.lab.trial.offline import simulated_trials
 from exo_gravity.lab.trial.scripted import read_script
 from exo_gravity.lab.trial.session import Session
+from exo_gravity.lab.vocabulary import of_all, source_of
 from exo_gravity.sim.params import SIMULATOR
 from exo_gravity.sim.script import TrialScript
 

@@ -14,17 +14,20 @@ from exo_gravity.core.compensation.settings import ModelError, Settings
 from exo_gravity.core.compensation.terms.catalogue import Friction
 from exo_gravity.core.compensation.terms.terms import TermSettings
 from exo_gravity.core.numbers import COVER
-from exo_gravity.lab.observer.momentum import OBSERVER, MomentumObserver, WearerEstimate
-from exo_gravity.lab.observer.share import (
+from exo_gravity.lab.observer import (
+    OBSERVER,
     PERIOD,
+    ContactWatch,
+    MomentumObserver,
     RunningShare,
     WearerCurve,
+    WearerEstimate,
+    WearerWatch,
     joint_shares,
     observed,
     share_of,
     while_between,
 )
-from exo_gravity.lab.observer.watch import ContactWatch, WearerWatch
 from exo_gravity.sim import STEP, ArmConfig, SimulatedArm
 from exo_gravity.sim.arm import DEFAULT_LINKS, felt_in_base
 from exo_gravity.sim.trunk_motion import TrunkState

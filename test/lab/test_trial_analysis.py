@@ -9,8 +9,7 @@ import pytest
 from scipy.integrate import quad
 
 from exo_gravity.lab.report.cohort import LEAST, spectral_arc_length
-from exo_gravity.lab.trial.analysis import HoldCriteria, analyse, failures
-from exo_gravity.lab.trial.recording import ARRAYS, ScriptedStep
+from exo_gravity.lab.trial.analysis import ARRAYS, HoldCriteria, ScriptedStep, analyse, failures
 
 from ..support.synthetic_bags import POSITION_CODE, RATE, VELOCITY_CODE, measured, smooth, still
 

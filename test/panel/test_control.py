@@ -28,9 +28,8 @@ from exo_gravity.lab import vocabulary as beside
 from exo_gravity.lab.inputs import parameter_file
 from exo_gravity.lab.inputs.arms import fitting
 from exo_gravity.panel import recordings
-from exo_gravity.panel.control import LIMITS, Control, Page, parse
+from exo_gravity.panel.control import LIMITS, NEWS_DELAY, PANEL, Control, LoadChanges, Page, parse, setup_of
 from exo_gravity.panel.recordings import Recordings
-from exo_gravity.panel.view import NEWS_DELAY, PANEL, LoadChanges, setup_of
 from exo_gravity.sim.script import TIMED, VALUED
 
 from ..support.panel_stage import WEARER_FILE, PlayedArms, PlayedFiles

@@ -15,9 +15,8 @@ from exo_gravity.core.motors.ak import unpack_reply
 from exo_gravity.core.motors.frames import ENTER, EXIT
 from exo_gravity.sim import VirtualWearer
 from exo_gravity.sim import device as device_module
-from exo_gravity.sim.arbitration import TAIL_BITS, frame_bits
 from exo_gravity.sim.script import TrialScript
-from exo_gravity.sim.virtual_time import Wire
+from exo_gravity.sim.virtual_time import TAIL_BITS, Wire, frame_bits
 
 from ..core.test_motors import stuffed_bits
 from ..support.ports import own_ports

@@ -15,9 +15,8 @@ from exo_gravity.core.compensation.settings import COMPENSATOR
 from exo_gravity.core.errors import ExoGravityError
 from exo_gravity.core.params import values_of
 from exo_gravity.core.safety.limits import CAN_BRIDGE
-from exo_gravity.panel.control import Control
+from exo_gravity.panel.control import SETTABLE, Control, LoadChanges, joint_rows, setup_of
 from exo_gravity.panel.server import PanelServer
-from exo_gravity.panel.view import SETTABLE, LoadChanges, joint_rows, setup_of
 
 from . import PARTS
 from .ports import free_port

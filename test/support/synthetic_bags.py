@@ -15,7 +15,7 @@ from rosbags.typesys import Stores, get_typestore
 from exo_gravity.core import ArmModel, gravity_torque
 from exo_gravity.lab.bag.content import TILT_TOPIC, TILT_TYPE, Bag
 from exo_gravity.lab.bag.reader import read_bag
-from exo_gravity.lab.trial.recording import Recording, ScriptedStep, Span
+from exo_gravity.lab.trial.analysis import Recording, ScriptedStep, Span
 
 STORE = get_typestore(Stores.ROS2_JAZZY)
 JOINT_STATE = "sensor_msgs/msg/JointState"

@@ -19,8 +19,7 @@ from exo_gravity.core.errors import DataError
 from exo_gravity.lab.calibration.imu import ImuRecord, mounting, six_rests
 from exo_gravity.lab.calibration.result import CalibrationResult, Change
 from exo_gravity.lab.inputs.parameter_file import load
-from exo_gravity.sim.imu import ImuConfig, SimulatedImu
-from exo_gravity.sim.trunk_motion import TrunkState
+from exo_gravity.sim.trunk_motion import ImuConfig, SimulatedImu, TrunkState
 
 from ..support import CONFIG
 from ..support.synthetic_bags import START, STORE, header, serialised, write_bag

@@ -32,12 +32,12 @@ from exo_gravity.lab.bag.content import Event, NodeStatus
 from exo_gravity.lab.bag.reader import read_bag
 from exo_gravity.lab.inputs.arms import configured_arm
 from exo_gravity.lab.inputs.parameter_file import load
+from exo_gravity.lab.observer import wearer_sentences
 from exo_gravity.lab.parallel import on_cluster
-from exo_gravity.lab.report import cohort, html, study, wearer_share
+from exo_gravity.lab.report import cohort, html, study
 from exo_gravity.lab.report.trial_report import STAMPS, analyse, print_report, write
-from exo_gravity.lab.trial.analysis import HoldCriteria
+from exo_gravity.lab.trial.analysis import HoldCriteria, Recording
 from exo_gravity.lab.trial.analysis import analyse as analysis_of
-from exo_gravity.lab.trial.recording import Recording
 from exo_gravity.lab.trial.session import Session
 
 from ..support import CONFIG, csv_rows
@@ -424,7 +424,7 @@ def test_the_share_of_the_recording_and_of_each_joint_is_found_and_said(share, i
     np.testing.assert_allclose(part.joints.value[known], share, atol=0.005)
     assert part.curve.time[0] >= 1.0 and part.curve.time[-1] <= 7.0  # while the arm was carried
     said, simulated, here = (
-        next(wearer_share.sentences(part, source, recording.joint_names))
+        next(wearer_sentences(part, source, recording.joint_names))
         for source in (Source.REAL, Source.SIMULATED, Source.UNKNOWN)
     )
     assert simulated == f"In the simulation, t{said[1:]}" and f"{100 * share:.0f} % of their arm's weight" in said
@@ -445,7 +445,7 @@ def test_a_share_needs_a_wearer_the_trunks_tilt_and_something_to_carry():
     upright = with_wearer(replace(shared(0.4), carried=None), {**GIVEN, "use_imu": False})
     assert upright.wearers["right"].curve.time[0] == 0.0
     hanging = with_wearer(still(JOINTS, (0.0,) * 4, (0.0,) * 4), {**GIVEN, "use_imu": False})
-    assert "nothing to carry" in next(wearer_share.sentences(hanging.wearers["right"], Source.UNKNOWN, JOINTS))
+    assert "nothing to carry" in next(wearer_sentences(hanging.wearers["right"], Source.UNKNOWN, JOINTS))
 
 
 # Of many recordings: a row for each, and one that fails is named

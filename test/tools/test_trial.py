@@ -30,7 +30,7 @@ from exo_gravity.core.errors import ParameterError
 from exo_gravity.lab import processes
 from exo_gravity.lab.report import video as clips
 from exo_gravity.lab.trial import run as running
-from exo_gravity.lab.trial.screen import BRIDGE_TIMEOUT, LEAD, TrialScreen
+from exo_gravity.lab.trial.run import BRIDGE_TIMEOUT, LEAD, TrialScreen
 from exo_gravity.lab.trial.scripted import analysed, read_script
 from exo_gravity.sim.script import TrialScript
 from exo_gravity.tools import trial

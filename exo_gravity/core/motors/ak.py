@@ -97,7 +97,7 @@ _motor = partial(
     family=FAMILY,
     output_encoder=False,
     can_fd=False,
-    shuts_off_at=120.0,  # of the one firmware that was run (sim/motors/firmware.py)
+    shuts_off_at=120.0,  # of the one firmware that was run (sim/motors/ak.py)
     assumed=frozenset(("shuts_off_at",)),
 )
 _SOURCE = "wire ranges: driver manual V1.0.15, table of MIT mode; CubeMars product page, "

@@ -9,9 +9,9 @@ import numpy as np
 
 from exo_gravity.core.params import Param, params_of
 from exo_gravity.core.vocabulary import Source
-from exo_gravity.lab.source import source_of
-from exo_gravity.lab.trial.recording import Recording
+from exo_gravity.lab.trial.analysis import Recording
 from exo_gravity.lab.trial.session import Session
+from exo_gravity.lab.vocabulary import source_of
 
 JOINT_STATE = "sensor_msgs/msg/JointState"
 STRING = "std_msgs/msg/String"

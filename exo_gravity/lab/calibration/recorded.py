@@ -16,13 +16,12 @@ import numpy as np
 from exo_gravity.core.arm.tilt import Tilt
 from exo_gravity.core.errors import DataError
 from exo_gravity.lab.bag.content import TILT_TOPIC, Bag
-from exo_gravity.lab.bag.layout import Decoder
 from exo_gravity.lab.bag.reader import read_bag
-from exo_gravity.lab.bag.storage import Storage
+from exo_gravity.lab.bag.storage import Decoder, Storage
 from exo_gravity.lab.calibration.moment_model import MomentModel
 from exo_gravity.lab.calibration.tracking import MOTION, Observation, Sweep, average, mean_direction
 from exo_gravity.lab.inputs.arms import ConfiguredArm
-from exo_gravity.lab.trial.recording import Recording, in_blocks, still_spans
+from exo_gravity.lab.trial.analysis import Recording, in_blocks, still_spans
 
 
 @dataclass(frozen=True)

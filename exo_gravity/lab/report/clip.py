@@ -25,9 +25,9 @@ from exo_gravity.lab.bag.content import Bag
 from exo_gravity.lab.inputs.arms import recorded_of
 from exo_gravity.lab.inputs.parameter_file import node_of
 from exo_gravity.lab.report.table import shown
-from exo_gravity.lab.source import of_all
-from exo_gravity.lab.trial.recording import Recording
+from exo_gravity.lab.trial.analysis import Recording
 from exo_gravity.lab.view import COLOURS, LINE, SPHERE, ArmView, Described, arm_shapes, described
+from exo_gravity.lab.vocabulary import of_all
 
 SIZE, GIF_SIZE, DPI = (6.4, 4.8), (4.8, 3.6), 100  # inches
 INK, LEADER = "#282c34", "#969ca4"

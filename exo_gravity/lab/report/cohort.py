@@ -15,8 +15,7 @@ import numpy as np
 from exo_gravity.core.errors import ExoGravityError
 from exo_gravity.lab.bag.storage import kind_of
 from exo_gravity.lab.parallel import Outcome
-from exo_gravity.lab.trial.analysis import HoldCriteria, TrialAnalysis
-from exo_gravity.lab.trial.recording import Recording
+from exo_gravity.lab.trial.analysis import HoldCriteria, Recording, TrialAnalysis
 
 SPEED_RATE = 50.0  # Hz, at which the speed of a movement is taken
 HIGHEST = 10.0  # Hz, of a movement

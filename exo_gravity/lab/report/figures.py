@@ -15,11 +15,10 @@ from matplotlib.figure import Figure
 from exo_gravity.core.errors import ParameterError
 from exo_gravity.core.numbers import COVER
 from exo_gravity.core.safety.limits import Limits
+from exo_gravity.lab.observer import WearerPart
 from exo_gravity.lab.report.html import FAINT, HOLD_COLOUR, INK, PUSH_COLOUR, joint_colours, make_plain
 from exo_gravity.lab.report.table import UNMOVED, joint_labels, per_minute, shown, unmoved
-from exo_gravity.lab.report.wearer_share import WearerPart
-from exo_gravity.lab.trial.analysis import HoldCriteria, TrialAnalysis
-from exo_gravity.lab.trial.recording import Recording, in_blocks
+from exo_gravity.lab.trial.analysis import HoldCriteria, Recording, TrialAnalysis, in_blocks
 
 INTERVALS = 2_000  # per curve
 WIDTH = 11.0  # inches

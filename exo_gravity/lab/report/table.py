@@ -13,8 +13,7 @@ from rich.console import Console
 from rich.table import Table
 
 from exo_gravity.lab.report import html
-from exo_gravity.lab.trial.analysis import Hold, Motion, TrialAnalysis
-from exo_gravity.lab.trial.recording import Recording
+from exo_gravity.lab.trial.analysis import Hold, Motion, Recording, TrialAnalysis
 
 Arm = tuple[Recording, TrialAnalysis]
 Row = Mapping[str, Any]

@@ -28,11 +28,11 @@ from exo_gravity.core.vocabulary import NONE, Source
 from exo_gravity.lab.bag.content import BRIDGE, Bag, Event
 from exo_gravity.lab.inputs.arms import recorded_of
 from exo_gravity.lab.inputs.parameter_file import node_of
-from exo_gravity.lab.report import html, table, wearer_share
-from exo_gravity.lab.source import STATEMENTS, of_all
-from exo_gravity.lab.trial.analysis import MIN_HOLD, HoldCriteria, TrialAnalysis, failures
+from exo_gravity.lab.observer import WearerPart, wearer_of, wearer_sentences
+from exo_gravity.lab.report import html, table
+from exo_gravity.lab.trial.analysis import MIN_HOLD, HoldCriteria, Recording, TrialAnalysis, failures
 from exo_gravity.lab.trial.analysis import analyse as analyse_arm
-from exo_gravity.lab.trial.recording import Recording
+from exo_gravity.lab.vocabulary import STATEMENTS, of_all
 
 if TYPE_CHECKING:
     from exo_gravity.lab.report.figures import Part
@@ -111,7 +111,7 @@ class Report:
     criteria: HoldCriteria
     arms: tuple[tuple[Recording, TrialAnalysis], ...]
     settings: dict[str, Conditions]  #: by the arm's name
-    wearers: dict[str, wearer_share.WearerPart]  #: by the arm's name, where what the wearer did is known
+    wearers: dict[str, WearerPart]  #: by the arm's name, where what the wearer did is known
     notes: tuple[str, ...]  #: what limits the trust in the verdict
     trouble: str = ""  #: why the trial ended before its script, or ''
 
@@ -231,7 +231,7 @@ def analyse(bag: Bag, criteria: HoldCriteria | None = None, min_hold: float = MI
     wearers, notes = {}, [*bag.notes, *_reservations(bag)]
     for recording in bag.recordings:
         try:
-            if part := wearer_share.of_arm(bag, recording):
+            if part := wearer_of(bag, recording):
                 wearers[recording.name] = part
         except (DataError, ParameterError) as error:
             notes.append(f"{recording.name}: the wearer's torque is not known: {error}")
@@ -292,8 +292,8 @@ def write(
             if text := figures.stayed_text(recording, analysis):
                 pictures.append(html.bullets("", [text]))
             if shared:
-                sentences = wearer_share.sentences(shared, source, recording.joint_names)
-                pictures.append(html.bullets("Wearer", sentences))
+                said = wearer_sentences(shared, source, recording.joint_names)
+                pictures.append(html.bullets("Wearer", said))
             sections += table.arm_section(recording, analysis, pictures)
         (folder / "report.html").write_text(_page(report, sections), encoding="utf-8")
         seconds = max(float(recording.time[-1]) for recording in report.bag.recordings)
@@ -318,7 +318,7 @@ def print_report(report: Report, console: Console | None = None) -> None:
     for recording, analysis in report.arms:
         table.print_tables(console, recording, analysis)
         if part := report.wearers.get(recording.name):
-            for sentence in wearer_share.sentences(part, report.bag.source(recording.name), recording.joint_names):
+            for sentence in wearer_sentences(part, report.bag.source(recording.name), recording.joint_names):
                 console.print(marked(sentence))
     for note in report.notes:
         console.print(f"[yellow]Note:[/] {marked(note)}.")

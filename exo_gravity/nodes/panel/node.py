@@ -40,9 +40,8 @@ from exo_gravity.nodes.ros.messages import HELD_BY, NOBODY, OK, Diagnostics
 from exo_gravity.nodes.ros.parameters import declare, plain
 from exo_gravity.nodes.ros.run import run
 from exo_gravity.nodes.ros.subscriptions import MANY_REQUESTS, PITCH_YAW
-from exo_gravity.panel.control import Control
+from exo_gravity.panel.control import PANEL, SETTABLE, Control, LoadChanges, Values, joint_rows, setup_of
 from exo_gravity.panel.recordings import Recordings
-from exo_gravity.panel.view import PANEL, SETTABLE, LoadChanges, Values, joint_rows, setup_of
 
 with extras("panel", "report"):
     from exo_gravity.panel.server import PanelServer

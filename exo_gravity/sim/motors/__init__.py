@@ -12,9 +12,8 @@ from exo_gravity.core.motors import ak as ak_family
 from exo_gravity.core.motors import damiao as damiao_family
 from exo_gravity.core.motors.joint_motor import JointMotor
 from exo_gravity.core.params import installed, loaded
-from exo_gravity.sim.motors.ak import Heat, SimulatedMotor
+from exo_gravity.sim.motors.ak import Firmware, Heat, SimulatedMotor
 from exo_gravity.sim.motors.damiao import DamiaoMotor
-from exo_gravity.sim.motors.firmware import Firmware
 
 GROUP = "exo_gravity.simulated_motors"
 OURS: Mapping[str, type[SimulatedMotor]] = {

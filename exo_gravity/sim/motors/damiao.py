@@ -40,8 +40,7 @@ from exo_gravity.core.motors.damiao import (
 )
 from exo_gravity.core.motors.frames import ENTER, EXIT, SET_ZERO, MotorCommand, MotorReply, unpack_fields
 from exo_gravity.core.motors.joint_motor import JointMotor
-from exo_gravity.sim.motors.ak import Heat, SimulatedMotor
-from exo_gravity.sim.motors.firmware import Firmware
+from exo_gravity.sim.motors.ak import Firmware, Heat, SimulatedMotor
 
 COIL_OVER_TEMPERATURE = 0xC
 DAMIAO = Firmware(
