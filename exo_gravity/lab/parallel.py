@@ -2,15 +2,16 @@
 """The same work on many items: in a process for each core, or on the workers of a Dask cluster.
 
 Outcomes come in the order in which they are finished, one for each item. The function must be importable, and a pure
-one: an item whose process dies is worked on again.
+one: on a cluster, an item whose worker dies is worked on again.
 """
 
 import os
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from concurrent.futures import ProcessPoolExecutor, as_completed
+from concurrent.futures import ProcessPoolExecutor, ThreadPoolExecutor, as_completed
 from concurrent.futures.process import BrokenProcessPool
 from dataclasses import dataclass
 from multiprocessing import get_context
+from queue import SimpleQueue
 from typing import Generic, TypeVar
 
 from exo_gravity.core.errors import ParameterError
@@ -37,35 +38,27 @@ def in_processes(
 ) -> Iterator[Outcome[Item, Result]]:
     """Yield the outcome of each item, worked on in `workers` processes (default: one for each core).
 
-    A process that dies takes the pool with it. Those items that it may have been working on then run one by one, and
-    one that ends its process again is the one that fails; a new pool goes on with the others.
+    Each thread has a process of its own, and a new one after a death: so the item that ended it is known.
     """
-    count = workers or os.cpu_count() or 1
-    left = dict.fromkeys(items)
-    while left:
-        for outcome in _in_pool(work, [*left], count):
-            del left[outcome.item]
-            yield outcome
-        for item in [*left][:count]:  # a pool works on them in their order
-            with ProcessPoolExecutor(1, SPAWNED) as alone:
-                outcome = _outcome(item, alone.submit(work, item).result, BrokenProcessPool)
-            del left[item]
-            yield outcome
+    idle = SimpleQueue[ProcessPoolExecutor]()
 
+    def worked_on(item: Item) -> Outcome[Item, Result]:
+        process = idle.get()
+        outcome = _outcome(item, lambda: process.submit(work, item).result(), BrokenProcessPool)
+        idle.put(process if outcome.problem != ENDED else ProcessPoolExecutor(1, SPAWNED))
+        return outcome
 
-def _in_pool(work: Callable[[Item], Result], items: Sequence[Item], workers: int) -> Iterator[Outcome[Item, Result]]:
-    """Yield the outcome of each item until a process dies."""
-    pool = ProcessPoolExecutor(min(workers, len(items)), SPAWNED)
+    count = min(workers or os.cpu_count() or 1, len(items) or 1)
+    for _ in range(count):
+        idle.put(ProcessPoolExecutor(1, SPAWNED))
+    threads = ThreadPoolExecutor(count)
     try:
-        futures = {pool.submit(work, item): item for item in items}
-        for future in as_completed(futures):
-            if isinstance(future.exception(), BrokenProcessPool):
-                return
-            yield _outcome(futures[future], future.result, BrokenProcessPool)
-    except BrokenProcessPool:  # already while items were submitted
-        return
+        for future in as_completed([threads.submit(worked_on, item) for item in dict.fromkeys(items)]):
+            yield future.result()
     finally:
-        pool.shutdown(cancel_futures=True)
+        threads.shutdown(cancel_futures=True)
+        while not idle.empty():
+            idle.get().shutdown()
 
 
 def on_cluster(address: str, work: Callable[[Item], Result], items: Iterable[Item]) -> Iterator[Outcome[Item, Result]]:
