@@ -17,7 +17,7 @@ from contextlib import ExitStack
 from dataclasses import asdict, dataclass, field
 from datetime import datetime
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 
@@ -30,7 +30,7 @@ from exo_gravity.core.safety.limits import Limits
 from exo_gravity.core.vocabulary import Source
 from exo_gravity.hardware.bus_lock import BusLock
 from exo_gravity.hardware.can_port import ArmOnBus
-from exo_gravity.hardware.clock import COMPUTER_CLOCK, Clock
+from exo_gravity.hardware.clock import COMPUTER_CLOCK
 from exo_gravity.hardware.control_loop import ControlLoop
 from exo_gravity.hardware.motor_bus import MotorBus
 from exo_gravity.lab.calibration.moment_model import MomentModel
@@ -103,7 +103,8 @@ class Lift(SampleController):
 class Bench:
     """An arm on the bench, its loop, and the person beside it.
 
-    loop: of the arm; its controller is `lift`.
+    loop: of the arm; its controller is a `Lift`.
+    motors: as the file has them.
     model: the arm without the weight, as the file has it.
     advance: lets the loop run for some s.
     ask: shows the person a request, and calls a function many times a second until it is done.
@@ -112,16 +113,15 @@ class Bench:
     def __init__(
         self,
         loop: ControlLoop,
-        lift: Lift,
         motors: Sequence[JointMotor],
         model: MomentModel,
         weight: Weight,
         advance: Callable[[float], None],
         ask: Callable[[str, Callable[[], str]], None],
-        clock: Clock,
     ) -> None:
-        self.loop, self.lift, self.motors, self.model, self.weight = loop, lift, motors, model, weight
-        self.advance, self.ask, self.clock = advance, ask, clock
+        self.loop, self.motors, self.model, self.weight = loop, motors, model, weight
+        self.lift, self.clock = cast(Lift, loop.controller), loop.bus.clock
+        self.advance, self.ask = advance, ask
         self.moments = model.moments + model.load(weight.mass, weight.lever)
 
     def needed(self, angles: Sequence[float]) -> float:
@@ -345,11 +345,10 @@ def accept_arm(params: Path, output: Path, arm: ConfiguredArm, weight: Weight, p
         bus = MotorBus(on_bus.ports(COMPUTER_CLOCK), arm.motors)
         held.callback(bus.close)
         bus.listen()
-        lift = Lift(arm.limits, period)
-        loop = ControlLoop(bus, arm.limits, period, lift)
+        loop = ControlLoop(bus, arm.limits, period, Lift(arm.limits, period))
         loop.start()
         held.callback(loop.stop)
-        bench = Bench(loop, lift, arm.motors, model, weight, time.sleep, person.wait, COMPUTER_CLOCK)
+        bench = Bench(loop, arm.motors, model, weight, time.sleep, person.wait)
         results = accept(bench, person.say)
     written = record(results, arm.name, source_of_bus(interface, channel))
     output.write_text(json.dumps(written, indent=2, default=float) + "\n", encoding="utf-8")

@@ -15,7 +15,7 @@ An arm from a URDF (`law: urdf`) is read from the compensator's own file or topi
 import math
 import threading
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from contextlib import suppress
 from typing import Any
 
@@ -24,9 +24,8 @@ from rclpy.node import Node
 from sensor_msgs.msg import JointState
 from std_msgs.msg import String
 
-from exo_gravity.core.arm.interface import STANDARD_GRAVITY, Arm
+from exo_gravity.core.arm.interface import STANDARD_GRAVITY
 from exo_gravity.core.arm.rotation import ZERO, Floats3
-from exo_gravity.core.arm.springs import Springs
 from exo_gravity.core.arm.tilt import Tilt, turning_in_base
 from exo_gravity.core.compensation.laws import URDF_LAW
 from exo_gravity.core.compensation.settings import Settings, settings_of
@@ -53,12 +52,9 @@ SILENCE = 0.5  # s without joint states, after which they are waited for
 # s without the compensator's diagnostics, which come twice a second: the middleware lists a killed node for 20 s
 COMPENSATOR_SILENCE = 2.0
 FRESH = 0.1  # s, age of the trunk's motion that is used
-WITHIN = "within rated torque everywhere"
 BRIDGE_PARAMETERS = {
     "motor", "torque_scale", "torque_scale_slope", "torque_scale_temperature", "position_min", "position_max",
 }  # fmt: skip
-# robot, the same with the wearer's whole arm, springs of device and wearer, support 0..1, largest tilt in rad
-Request = tuple[Arm, Arm, tuple[Springs, Springs], float, float]
 
 
 class BudgetWatch:
@@ -75,45 +71,33 @@ class BudgetWatch:
         self.largest_support = UNKNOWN
         self._logger = node.get_logger()
         self._bridge = NodeParameters(node, "can_bridge", once=True, fitting=fitting)
-        self._request: Request | None = None
+        self._checked: object = None  # what the motors were last found to hold, or not
 
-    def update(self, names: Sequence[str], settings: Settings) -> None:
-        """Check `settings` if they are new; names: of the joints (n,)."""
-        if settings.law == URDF_LAW:
+    def update(self, names: Sequence[str], s: Settings) -> None:
+        """Check the compensator's settings if they are new; names: of the joints (n,)."""
+        if s.law == URDF_LAW:
             self.result = Reason(Budget.UNKNOWN, "unknown: it is watched for the paper's arm alone")
             return
         self._bridge.update()
-        request = request_of(settings)
-        if self._bridge.values.keys() >= BRIDGE_PARAMETERS and request != self._request:
-            self._request = request
-            self.result, self.largest_support = compute(names, request, self._bridge.values)
-            if self.result.word != Budget.WITHIN_RATED:
-                self._logger.warning(f"{self.result}; efforts stay clamped to max_effort")
-
-
-def request_of(s: Settings) -> Request:
-    """Return what the motors must be able to hold with these settings."""
-    support = (1.0 if s.support_adapts else s.support) if s.mode == "zero_g" else 0.0
-    tilt = math.radians(USUAL_TILT) if s.use_imu else 0.0
-    return s.loaded, s.worn(s.loaded), (s.joint_spring, s.tissue), support, tilt
-
-
-def compute(names: Sequence[str], request: Request, bridge: Mapping[str, Any]) -> tuple[Reason, str]:
-    """Return `result` and `largest_support` of `BudgetWatch`.
-
-    names: of the joints (n,).
-    bridge: its parameter values.
-    """
-    robot, full, springs, support, tilt = request
-    try:
-        bounds = workspace(bridge["position_min"], bridge["position_max"], tilt)
-        rated, peak = motor_torques(bridge)
-        joints = budget(robot, full, springs, support, bounds, rated, peak)
-    except ParameterError as error:
-        return Reason(Budget.UNKNOWN, f"unknown: can_bridge has {error}"), UNKNOWN
-    overloaded = overload(names, joints)
-    result = Reason(Budget.ABOVE_RATED, overloaded) if overloaded else Reason(Budget.WITHIN_RATED, WITHIN)
-    return result, f"{largest_support(joints) or 0.0:g}" if full != robot else NONE
+        support = (1.0 if s.support_adapts else s.support) if s.mode == "zero_g" else 0.0
+        arms, springs = (s.loaded, s.worn(s.loaded)), (s.joint_spring, s.tissue)
+        carried, bridge = (*arms, springs, support, s.use_imu), self._bridge.values
+        if not bridge.keys() >= BRIDGE_PARAMETERS or carried == self._checked:
+            return
+        self._checked, self.largest_support = carried, UNKNOWN
+        try:
+            tilt = math.radians(USUAL_TILT) if s.use_imu else 0.0
+            bounds = workspace(bridge["position_min"], bridge["position_max"], tilt)
+            joints = budget(*arms, springs, support, bounds, *motor_torques(bridge))
+        except ParameterError as error:
+            self.result = Reason(Budget.UNKNOWN, f"unknown: can_bridge has {error}")
+        else:
+            overloaded = overload(names, joints)
+            word = Budget.ABOVE_RATED if overloaded else Budget.WITHIN_RATED
+            self.result = Reason(word, overloaded or "within rated torque everywhere")
+            self.largest_support = NONE if arms[0] == arms[1] else f"{largest_support(joints) or 0.0:g}"
+        if self.result.word != Budget.WITHIN_RATED:
+            self._logger.warning(f"{self.result}; efforts stay clamped to max_effort")
 
 
 class Trunk:

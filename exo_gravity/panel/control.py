@@ -159,17 +159,9 @@ FOR_ALL = ("let_down", "take", "marker")
 CHANGEABLE = {**SETTABLE, **OF_SUBJECT}
 
 
-@dataclass(frozen=True)
-class PageLimits:
-    """What the panel allows its pages."""
-
-    #: s without a confirmation after which a page is gone; longer than a lease lasts, so that the next page
-    #: finds the arm let down
-    gone: float = 2.0
-    pages: int = 32  #: at once
-
-
-LIMITS = PageLimits()
+# s without a confirmation after which a page is gone; longer than a lease lasts: the next page finds the arm let down
+GONE = 2.0
+MOST_PAGES = 32  # at once
 
 
 def parse(body: Any, arms: Collection[str], trials: Collection[str]) -> dict[str, Any]:
@@ -251,9 +243,9 @@ class Control:
         """
         page = self._pages.get(secret)
         if page is None:
-            if len(self._pages) >= LIMITS.pages:  # those that are closed lose their numbers
+            if len(self._pages) >= MOST_PAGES:  # those that are closed lose their numbers
                 self._pages = {known.secret: known for known in self._pages.values() if known.connection}
-            if len(self._pages) >= LIMITS.pages:
+            if len(self._pages) >= MOST_PAGES:
                 return None
             self._numbers += 1
             page = Page(secrets.token_urlsafe(24), self._numbers, address, self.clock())
@@ -271,7 +263,7 @@ class Control:
 
     def is_gone(self) -> bool:
         """Return whether a page holds control that is gone."""
-        return self.holder is not None and self.clock() - self.holder.seen > LIMITS.gone
+        return self.holder is not None and self.clock() - self.holder.seen > GONE
 
     @property
     def other_operator(self) -> str:

@@ -127,7 +127,7 @@ class Rig(VirtualArm):
     def between_cycles(self, *functions: Callable[[float], object]) -> None:
         """Call each function with the time in s, before the next cycle."""
         for function in functions:
-            self.loop.call(partial(_call, function, self.clock.monotonic))
+            self.loop.call(partial(lambda act: act(self.now), function))
 
     def act(self, *steps: Mapping[str, object]) -> None:
         """Let the wearer do these steps of a trial script from now on; nothing without steps."""
@@ -170,10 +170,6 @@ class Rig(VirtualArm):
         gravity = gravity_in_trunk(seen.pitch, seen.roll).tolist()
         self.newest_reading = self.imu_frozen or TrunkReading(gravity, None, seen.angular_velocity)
         return None if self.imu_silent else self.newest_reading
-
-
-def _call(function: Callable[[float], object], clock: Callable[[], float]) -> None:
-    function(clock())
 
 
 RAMP_STEPS = 20  # in which an IMU's error grows, or a motor warms

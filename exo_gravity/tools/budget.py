@@ -17,7 +17,7 @@ from exo_gravity.core.numbers import one_float
 from exo_gravity.lab.budget import USUAL_TILT, ArmBudget, arm_budget, joint_figure, table_lines, verdict
 from exo_gravity.lab.inputs.arms import configured_arms
 from exo_gravity.lab.report.html import png_of
-from exo_gravity.tools.cli import exit_code
+from exo_gravity.tools.cli import command
 
 
 def _arguments(args: Sequence[str] | None) -> argparse.Namespace:
@@ -73,7 +73,4 @@ def _run(options: argparse.Namespace) -> int:
     return int(any(arm.is_beyond for arm in arms))
 
 
-def main(args: Sequence[str] | None = None) -> int:
-    """Run the command line; return the exit code."""
-    options = _arguments(args)
-    return exit_code("budget", "report", lambda: _run(options))
+main = command("budget", "report", _arguments, _run)

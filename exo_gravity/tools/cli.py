@@ -9,7 +9,7 @@ import argparse
 import math
 import os
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from functools import partial
 from io import TextIOWrapper
 
@@ -54,6 +54,21 @@ def exit_code(tool: str, extra: str, work: Callable[[], int]) -> int:
         print(f"{tool}: {error}", file=sys.stderr)
         _give_up_output()
         return 2
+
+
+def command(
+    name: str,
+    extra: str,
+    arguments: Callable[[Sequence[str] | None], argparse.Namespace],
+    run: Callable[[argparse.Namespace], int],
+) -> Callable[[Sequence[str] | None], int]:
+    """Return the entry point of a tool: it runs the command line, and returns the exit code."""
+
+    def main(args: Sequence[str] | None = None) -> int:
+        options = arguments(args)
+        return exit_code(name, extra, lambda: run(options))
+
+    return main
 
 
 def print_any_character() -> None:

@@ -23,7 +23,7 @@ from exo_gravity.lab.bag.content import Bag
 from exo_gravity.lab.report import html, video
 from exo_gravity.lab.trial.analysis import MIN_HOLD, HoldCriteria
 from exo_gravity.lab.vocabulary import of_all
-from exo_gravity.tools.cli import exit_code, extras, non_negative, positive
+from exo_gravity.tools.cli import command, extras, non_negative, positive
 
 
 def _arguments(args: Sequence[str] | None) -> argparse.Namespace:
@@ -75,12 +75,6 @@ def _arguments(args: Sequence[str] | None) -> argparse.Namespace:
     if (options.width or options.font) and not options.figures:
         parser.error("--width and --font are those of --figures")
     return options
-
-
-def main(args: Sequence[str] | None = None) -> int:
-    """Run the command line; return the exit code."""
-    options = _arguments(args)
-    return exit_code("report", "report", lambda: _run(options))
 
 
 def _run(options: argparse.Namespace) -> int:
@@ -178,3 +172,6 @@ def _run_cohort(options: argparse.Namespace, criteria: HoldCriteria, on_paper: h
     if study.problems_of(trials):
         return 2
     return int(not all(row["held"] for row in trials))
+
+
+main = command("report", "report", _arguments, _run)

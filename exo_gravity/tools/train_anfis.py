@@ -15,7 +15,7 @@ from exo_gravity.core.arm.tilt import SIDES
 from exo_gravity.lab.anfis import JOINTS
 from exo_gravity.lab.inputs.arms import configured_arm
 from exo_gravity.lab.inputs.references import PAPER_ANFIS
-from exo_gravity.tools.cli import exit_code
+from exo_gravity.tools.cli import command
 
 RECORDED_RIDGE = 0.03  # larger, because recorded torques contain noise and stiction that the law must not learn
 
@@ -58,7 +58,4 @@ def _run(options: argparse.Namespace) -> int:
     return 0
 
 
-def main(args: Sequence[str] | None = None) -> int:
-    """Run the command line; return the exit code."""
-    options = _arguments(args)
-    return exit_code("train_anfis", "report,validate", lambda: _run(options))
+main = command("train_anfis", "report,validate", _arguments, _run)

@@ -15,7 +15,7 @@ from exo_gravity.core.arm.tilt import SIDES
 from exo_gravity.core.errors import named
 from exo_gravity.lab.inputs.arms import configured_arm, configured_arms
 from exo_gravity.lab.view import described, urdf
-from exo_gravity.tools.cli import exit_code
+from exo_gravity.tools.cli import command
 
 
 def urdf_of(params: str | Path, side: str = "", meshes: str = "") -> str:
@@ -44,7 +44,4 @@ def _run(options: argparse.Namespace) -> int:
     return 0
 
 
-def main(args: Sequence[str] | None = None) -> int:
-    """Run the command line; return the exit code."""
-    options = _arguments(args)
-    return exit_code("urdf", "report", lambda: _run(options))
+main = command("urdf", "report", _arguments, _run)

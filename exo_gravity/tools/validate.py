@@ -15,7 +15,7 @@ from pathlib import Path
 
 from exo_gravity.core.arm.tilt import SIDES
 from exo_gravity.lab.inputs.arms import configured_arm, with_cog_at_link_ends
-from exo_gravity.tools.cli import exit_code
+from exo_gravity.tools.cli import command
 
 COUNT, QUICK_COUNT = 100_000, 2_000  # random poses per limit of the tilt
 
@@ -49,7 +49,4 @@ def _run(options: argparse.Namespace) -> int:
     return int(not all(held for held, _ in verdicts))
 
 
-def main(args: Sequence[str] | None = None) -> int:
-    """Run the command line; return the exit code."""
-    options = _arguments(args)
-    return exit_code("validate", "report,validate", lambda: _run(options))
+main = command("validate", "report,validate", _arguments, _run)

@@ -67,7 +67,7 @@ def acceptance(
     person, rate = Person(forgets), arm.can_bridge["rate"]
     lift = Lift(arm.limits, 1.0 / rate)
     person.arm = played = VirtualArm(device, lift, motors, arm.limits, rate)
-    bench = Bench(played.loop, lift, motors, model_of(arm), weight, played.run, person.ask, played.clock)
+    bench = Bench(played.loop, motors, model_of(arm), weight, played.run, person.ask)
     results = accept(bench, person.said.append)
     assert not device.powered
     assert len(person.said) == len(results)

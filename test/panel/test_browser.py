@@ -7,7 +7,6 @@ by axe. What requests are allowed, and what becomes of them, the tests of contro
 
 import re
 from collections.abc import Callable
-from dataclasses import replace
 from typing import Any
 
 import pytest
@@ -388,7 +387,7 @@ def test_the_page_says_which_arm_is_simulated_as_the_devices_say(page, stage):
 
 def test_a_second_page_watches_lets_down_and_takes_control_and_no_page_shows_an_old_state(visit, stage, monkeypatch):
     # A busy machine silences a page for seconds.
-    monkeypatch.setattr(control, "LIMITS", replace(control.LIMITS, gone=PATIENCE / 1000))
+    monkeypatch.setattr(control, "GONE", PATIENCE / 1000)
     first, second = visit(), visit()
     second.wait_for_selector("#take:visible")
     assert second.is_disabled(of_arm(".enable"))

@@ -28,7 +28,7 @@ from exo_gravity.lab import vocabulary as beside
 from exo_gravity.lab.inputs import parameter_file
 from exo_gravity.lab.inputs.arms import fitting
 from exo_gravity.panel import recordings
-from exo_gravity.panel.control import LIMITS, NEWS_DELAY, PANEL, Control, LoadChanges, Page, parse, setup_of
+from exo_gravity.panel.control import GONE, MOST_PAGES, NEWS_DELAY, PANEL, Control, LoadChanges, Page, parse, setup_of
 from exo_gravity.panel.recordings import Recordings
 from exo_gravity.sim.script import TIMED, VALUED
 
@@ -166,15 +166,15 @@ def test_control_is_taken_and_given_up_here_and_at_the_arms(panel):
 
 
 def test_the_operators_page_is_gone_when_it_confirms_nothing_for_a_while_and_a_new_page_takes_over(panel):
-    assert LIMITS.gone > LEASE_TIME + 0.1  # s between two looks of the bridge: the arm has been let down by then
-    panel.now += LIMITS.gone
+    assert GONE > LEASE_TIME + 0.1  # s between two looks of the bridge: the arm has been let down by then
+    panel.now += GONE
     assert not panel.is_gone()
     panel.now += 0.01
     panel.confirm(panel.second)
     assert panel.is_gone()
     panel.confirm(panel.first)
     assert not panel.is_gone()
-    panel.now += LIMITS.gone + 0.1
+    panel.now += GONE + 0.1
     assert panel.opened() is panel.holder
 
 
@@ -182,7 +182,7 @@ def test_a_reloaded_page_stays_the_same_and_only_pages_that_are_open_count(panel
     panel.first.connection = None
     assert panel.opened(secret=panel.first.secret) is panel.first is panel.holder and panel.first.number == 1
     assert panel.opened(secret="my own").secret != "my own"
-    pages = [panel.opened() for _ in range(LIMITS.pages - 3)]
+    pages = [panel.opened() for _ in range(MOST_PAGES - 3)]
     assert panel.open("", "10.0.0.1") is None
     pages[2].connection = None
     panel.opened()

@@ -34,6 +34,7 @@ from exo_gravity.core.motors.frames import (
     unpack_fields,
 )
 from exo_gravity.core.motors.joint_motor import MAX_STATUS_RATE, JointMotor
+from exo_gravity.core.numbers import clamp
 from exo_gravity.core.params import check_owned, owned
 
 FIRST_SPECIAL = 0xFC  # last byte of ENTER, the lowest special frame of the manual
