@@ -64,14 +64,16 @@ class Weighed(NamedTuple):
 def refusal(s: Settings, terms: Sequence[str], rate: float) -> Reason:
     """Return why nothing can be weighed with these settings, active terms, and joint states at `rate` Hz."""
     if carriers := [name for name in terms if name in CARRIERS]:
-        carried = f"{', '.join(carriers)} would carry a part of the load: switch it off"
-        return Reason(WeighingRefused.TERMS, carried)
+        return Reason(WeighingRefused.TERMS, f"{', '.join(carriers)} would carry a part of the load: switch it off")
     if any(s.wearer_mass) and (s.mode != "zero_g" or s.support < 1.0):
-        relaxed = "a wearer can relax only while the whole arm is carried: mode zero_g with support 1"
-        return Reason(WeighingRefused.SUPPORT, relaxed)
+        return Reason(
+            WeighingRefused.SUPPORT,
+            "a wearer can relax only while the whole arm is carried: mode zero_g with support 1",
+        )
     if rate < WEIGHING.least_rate:
-        slow = f"joint states come at {rate:.0f} Hz, must be {WEIGHING.least_rate:g} or more"
-        return Reason(WeighingRefused.SLOW, slow)
+        return Reason(
+            WeighingRefused.SLOW, f"joint states come at {rate:.0f} Hz, must be {WEIGHING.least_rate:g} or more"
+        )
     if not s.robot.has_hand:
         return Reason(WeighingRefused.NO_HAND, "urdf.hand does not say which link holds a load")
     return NO_REASON
@@ -189,8 +191,9 @@ class Weighing:
         fastest = max(map(abs, velocity))
         if np.linalg.norm(self._lever) < WEIGHING.least_lever:
             pose = "bend the elbow to a right angle, or raise the arm to the side"
-            hangs = f"the hand hangs below the joints, where a load needs no torque: {pose}"
-            self.trouble = Reason(WeighingTrouble.HANGS_DOWN, hangs)
+            self.trouble = Reason(
+                WeighingTrouble.HANGS_DOWN, f"the hand hangs below the joints, where a load needs no torque: {pose}"
+            )
             return
         if fastest > WEIGHING.start_speed:
             self.trouble = Reason(WeighingTrouble.MOVES, f"the arm moves at {fastest:.2f} rad/s: hold it still")
@@ -236,11 +239,14 @@ class Weighing:
         elif abs(error[worst]) > WEIGHING.largest_error:
             is_thrown = float(error @ self._lever) < 0.0
             why = "was the load dropped?" if is_thrown else "relax gradually, and touch nothing"
-            away = f"{self._names[worst]} moved by {abs(error[worst]):.2f} rad: {why}"
-            self.trouble = Reason(WeighingTrouble.MOVED_AWAY, away)
+            self.trouble = Reason(
+                WeighingTrouble.MOVED_AWAY, f"{self._names[worst]} moved by {abs(error[worst]):.2f} rad: {why}"
+            )
         elif self._foreign > WEIGHING.persistence:
-            hand = f"{self._names[int(np.argmax(foreign))]}: {max(foreign):.1f} Nm of a hand on the arm"
-            self.trouble = Reason(WeighingTrouble.HAND_ON_ARM, hand)
+            self.trouble = Reason(
+                WeighingTrouble.HAND_ON_ARM,
+                f"{self._names[int(np.argmax(foreign))]}: {max(foreign):.1f} Nm of a hand on the arm",
+            )
         elif saturated:
             remedy = "the load needs more than max_effort here: hold it nearer to the body"
             self.trouble = Reason(WeighingTrouble.TOO_HEAVY, f"{', '.join(saturated)}: {remedy}")
@@ -258,16 +264,20 @@ class Weighing:
         unlike = np.abs(seen.effort - needed) - known - WEIGHING.unlike[0] - WEIGHING.unlike[1] * np.abs(needed)
         restless = math.hypot(*(weight * unrest)) / gravity
         if restless > WEIGHING.unrest[0] + WEIGHING.unrest[1] * abs(mass):
-            between = f"{restless:.2f} kg between two turns: relax, and touch nothing"
-            self.trouble = Reason(WeighingTrouble.RESTLESS, between)
+            self.trouble = Reason(
+                WeighingTrouble.RESTLESS, f"{restless:.2f} kg between two turns: relax, and touch nothing"
+            )
         for name, share, off in zip(self._names, shares, unlike, strict=True):
             if share < MOTION.followed:
-                stays = f"{name} does not follow: is the arm carried, is a hand on it?"
-                self.trouble = Reason(WeighingTrouble.NOT_FOLLOWED, stays)
+                self.trouble = Reason(
+                    WeighingTrouble.NOT_FOLLOWED, f"{name} does not follow: is the arm carried, is a hand on it?"
+                )
             elif off > 0.0:
                 torque = f"{off + WEIGHING.unlike[0]:.1f} Nm"
-                unlike_load = f"{name}: no load in the hand explains {torque}: someone may be touching the arm"
-                self.trouble = Reason(WeighingTrouble.NO_LOAD, unlike_load)
+                self.trouble = Reason(
+                    WeighingTrouble.NO_LOAD,
+                    f"{name}: no load in the hand explains {torque}: someone may be touching the arm",
+                )
         if not self.trouble:
             self.result = Weighed(mass, math.hypot(*(weight * seen.spread)) / gravity, self._lever)
 

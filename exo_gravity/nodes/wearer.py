@@ -207,8 +207,7 @@ class WearerNode(Node):
             self._refusal = Reason(NoEstimate.REFUSED_PARAMETERS, f"the compensator has {what}")
             return
         if settings is None:
-            waiting = f"waiting for the arm's URDF on {values['urdf.topic']}"
-            self._refusal = Reason(NoEstimate.NO_DESCRIPTION, waiting)
+            self._refusal = Reason(NoEstimate.NO_DESCRIPTION, f"waiting for the arm's URDF on {values['urdf.topic']}")
             return
         topic = "joint_states"
         if values.get("command_interface") == "multi_array":
@@ -220,8 +219,10 @@ class WearerNode(Node):
             self._trunk = Trunk(self, settings) if settings.use_imu else None
             self._watch = WearerWatch(self._names, settings)
         if fixed != self._fixed:
-            refusal = "the compensator has other joints or another trunk than before: restart this node"
-            self._refusal = Reason(NoEstimate.REFUSED_PARAMETERS, refusal)
+            self._refusal = Reason(
+                NoEstimate.REFUSED_PARAMETERS,
+                "the compensator has other joints or another trunk than before: restart this node",
+            )
             return
         with self._lock:
             self._watch.apply(settings)
@@ -283,8 +284,10 @@ class WearerNode(Node):
         elif trunk is None:
             self._problem = Reason(NoEstimate.NO_TILT, "no fresh tilt of the trunk")
         else:
-            incomplete = "joint_states have no positions, velocities and efforts of these joints"
-            self._problem = Reason(NoEstimate.INCOMPLETE_JOINT_STATES, incomplete)
+            self._problem = Reason(
+                NoEstimate.INCOMPLETE_JOINT_STATES,
+                "joint_states have no positions, velocities and efforts of these joints",
+            )
         self._ask_for_support()
 
     def _joints(self, message: JointState) -> list[tuple[float, ...]] | None:
