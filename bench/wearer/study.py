@@ -28,10 +28,10 @@ from exo_gravity.core.safety.limits import Limits
 from exo_gravity.lab.observer import Share, WearerCurve, observed, share_of
 from exo_gravity.lab.trial.offline import ArmSetup, OfflineTrial
 from exo_gravity.sim import STEP, SimulatedImu, VirtualWearer
+from exo_gravity.sim.device import path_between
 from exo_gravity.sim.script import TrialScript
 from exo_gravity.sim.trunk_motion import ImuConfig, TrunkState
 from exo_gravity.sim.virtual_arm import TrunkReading
-from exo_gravity.sim.virtual_wearer import path_between
 
 from .devices import ARM, Worn, draw, turned
 

@@ -30,8 +30,7 @@ from exo_gravity.core.errors import ParameterError
 from exo_gravity.core.motors.joint_motor import SIMULATED_BUSES
 from exo_gravity.core.safety.descent import DESCENT_TIMEOUT
 from exo_gravity.core.safety.limits import CONFIRM
-from exo_gravity.lab.inputs.parameter_file import Nodes, load, stages
-from exo_gravity.lab.inputs.ros_yaml import text_of
+from exo_gravity.lab.inputs.parameter_file import Nodes, load, stages, text_of
 from exo_gravity.lab.packages import check_packages
 
 NODES_PACKAGE = "exo_gravity.nodes."

@@ -25,9 +25,9 @@ import yaml
 from exo_gravity.core.errors import ParameterError
 from exo_gravity.core.params import ROS_PARAMETERS
 from exo_gravity.core.safety.command import State
-from exo_gravity.lab.inputs.ros_yaml import dumped, text_of
+from exo_gravity.lab.bag.content import Session, check_text
+from exo_gravity.lab.inputs.parameter_file import dumped, text_of
 from exo_gravity.lab.processes import Launcher, program
-from exo_gravity.lab.trial.session import Session, check_text
 from exo_gravity.panel.control import OF_SUBJECT
 from exo_gravity.sim.script import TrialScript
 

@@ -13,10 +13,9 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from exo_gravity.sim.arm import STEP, ArmConfig, SimulatedArm
-    from exo_gravity.sim.device import SimulatedDevice
+    from exo_gravity.sim.device import SimulatedDevice, VirtualWearer
     from exo_gravity.sim.motors.ak import FIRMWARES, Firmware, SimulatedMotor
     from exo_gravity.sim.trunk_motion import ImuConfig, SimulatedImu
-    from exo_gravity.sim.virtual_wearer import VirtualWearer
 
 __all__ = [
     "FIRMWARES",
@@ -32,10 +31,9 @@ __all__ = [
 ]
 MODULES = {
     "arm": ("STEP", "ArmConfig", "SimulatedArm"),
-    "device": ("SimulatedDevice",),
+    "device": ("SimulatedDevice", "VirtualWearer"),
     "motors.ak": ("FIRMWARES", "Firmware", "SimulatedMotor"),
     "trunk_motion": ("ImuConfig", "SimulatedImu"),
-    "virtual_wearer": ("VirtualWearer",),
 }
 
 

@@ -17,18 +17,181 @@ import random
 import select
 import time
 from collections.abc import Callable, Collection, Sequence
+from pathlib import Path
+from typing import Any
 
 import can
+import numpy as np
 
 from exo_gravity.core.errors import BusError, ParameterError
 from exo_gravity.core.motors.frames import EXTENDED, Frame
+from exo_gravity.core.numbers import JOINT_COUNT, Torque, clamp, for_joints
 from exo_gravity.hardware.can_port import POLL_TIME, message_of
 from exo_gravity.sim.arm import STEP, SimulatedArm
 from exo_gravity.sim.motors.ak import SimulatedMotor
-from exo_gravity.sim.script import IDLE
-from exo_gravity.sim.trunk_motion import TrunkMotion, TrunkState, motion_of
-from exo_gravity.sim.truth import TruthLog, TruthRecords
-from exo_gravity.sim.virtual_wearer import VirtualWearer
+from exo_gravity.sim.script import IDLE, TrialScript
+from exo_gravity.sim.trunk_motion import TrunkMotion, TrunkState, minimum_jerk, motion_of
+
+# The hand's compliance in Nm/rad, Nm s/rad and Nm/(rad s): of the order of a human arm's; least damping where the arm
+# is lightest. Of the paper's arm; the least of each for another one.
+STIFFNESS, DAMPING, INTEGRAL = (60.0, 80.0, 60.0, 30.0), (3.0, 6.0, 5.0, 2.0), (120.0, 160.0, 150.0, 80.0)
+STRENGTH = 25.0  # Nm on any joint; an adult's arm and the robot, stretched out, need 15 to 20 Nm
+MOVING = 0.75  # share of a move's duration in which the hand moves; then it holds the arm still
+
+Course = list[tuple[float, float]]  # of each joint: position in rad, velocity in rad/s
+
+
+class VirtualWearer:
+    """Performs `script` once, with at most `strength` Nm on any joint.
+
+    Move: a hand leads the joints along minimum-jerk paths (Flash and Hogan 1985) to the pose, holds them there for the
+    last quarter of the time, and lets go. The hand is a spring, a damper and an integrator that takes over the arm's
+    weight, all limited to the strength of a hand. Hold: no torque. Push: half a sine wave of the scripted torques.
+
+    step: index of the current step, None before the first, len(steps) after the last.
+    """
+
+    def __init__(self, script: TrialScript, strength: float = STRENGTH) -> None:
+        self.script = script
+        self.strength = strength
+        self.step: int | None = None
+        self._elapsed = 0.0
+        self._start: Sequence[float] = ()
+        self._weight: list[float] = []
+
+    def torque(self, elapsed: float, theta: Sequence[float], velocity: Sequence[float]) -> Torque:
+        """Return the wearer's torque (n,) in Nm on the joints, `elapsed` s after the start of the script.
+
+        theta, velocity: (n,) rad and rad/s. Call it with increasing times: the hand remembers where it took hold and
+        how much weight it has taken over. The torque is zero before the start (elapsed < 0) and after the end.
+        """
+        nothing = (0.0,) * len(theta)
+        if elapsed < 0:
+            return nothing
+        index, since = self.script.at(elapsed)
+        if index != self.step:
+            self.step = index
+            self._start = theta
+            self._weight = [0.0] * len(theta)
+        period, self._elapsed = elapsed - self._elapsed, elapsed
+        if index == len(self.script.steps):
+            return nothing
+        step = self.script.steps[index]
+        if step.action == "move":
+            path = path_between(self._start, step.value, since, MOVING * step.duration)
+            return self.lead(path, theta, velocity, period)
+        if step.action == "push":
+            share = math.sin(math.pi * since / step.duration)
+            return tuple(share * torque for torque in step.value)
+        return nothing
+
+    def idle(self, elapsed: float, duration: float) -> bool:
+        """Return whether the wearer applies no torque for `duration` s from `elapsed` s after the start."""
+        index, since = self.script.at(elapsed)
+        if elapsed < 0.0 or index == len(self.script.steps):
+            return elapsed + duration <= 0.0 or elapsed >= 0.0
+        step = self.script.steps[index]
+        return index == self.step and step.action == "hold" and since + duration <= step.duration
+
+    def lead(self, path: Course, theta: Sequence[float], velocity: Sequence[float], period: float) -> Torque:
+        """Return the torque (n,) in Nm of a hand that leads the joints along `path`; period: s since the last call."""
+        torque, limit = [], self.strength
+        self._weight = self._weight or [0.0] * len(path)
+        compliance = (for_joints(tuning, len(path)) for tuning in (STIFFNESS, DAMPING, INTEGRAL))
+        for n, ((position, speed), *hand) in enumerate(zip(path, *compliance, strict=True)):
+            stiffness, damping, integral = hand
+            error = position - theta[n]
+            self._weight[n] = clamp(self._weight[n] + integral * error * period, limit)
+            pull = stiffness * error + damping * (speed - velocity[n]) + self._weight[n]
+            torque.append(clamp(pull, limit))
+        return tuple(torque)
+
+
+def path_between(start: Sequence[float], end: Sequence[float], since: float, duration: float) -> Course:
+    """Return where the joints are `since` s into a minimum-jerk move from `start` to `end`, (n,) rad, in `duration`."""
+    way, pace, _ = minimum_jerk(since / duration)
+    return [(a + way * (b - a), pace / duration * (b - a)) for a, b in zip(start, end, strict=True)]
+
+
+# time: wall clock in s. position, velocity: of the joints, rad and rad/s. torque: of the motors on the joints, Nm.
+# damping: Nm s/rad, the part of that torque that is proportional to the velocity. weight: Nm that would hold the joints
+# against gravity. wearer: Nm of the wearer on the joints. frames: received by each motor so far. step: of the wearer's
+# script, -1 before it. on: whether each motor is on.
+def record_of(count: int) -> np.dtype:
+    """Return the type of a record of an arm with `count` joints.
+
+    The file is a sequence of records, of which `record_of` is the only description. They leave the process every
+    `FLUSH_PERIOD`; what was written stays when the process is frozen or killed.
+    """
+    return np.dtype(
+        [
+            ("time", "<f8"),
+            ("position", "<f4", (count,)),
+            ("velocity", "<f4", (count,)),
+            ("torque", "<f4", (count,)),
+            ("damping", "<f4", (count,)),
+            ("weight", "<f4", (count,)),
+            ("wearer", "<f4", (count,)),
+            ("frames", "<u4", (count,)),
+            ("step", "<i4"),
+            ("on", "?", (count,)),
+        ]
+    )
+
+
+RECORD = record_of(JOINT_COUNT)  # of the paper's arm
+FLUSH_PERIOD = 0.02  # s
+
+
+class TruthRecords:
+    """Keeps the records in memory, by simulated time: for a judge in the same process."""
+
+    def __init__(self) -> None:
+        self._rows: list[tuple[Any, ...]] = []
+
+    def synchronise(self, now: float) -> None:
+        """Do nothing: the records have the simulated time."""
+
+    def note(self, now: float, *state: Any) -> None:
+        """Append the `state` of the arm at the simulated time `now` (s): the fields of RECORD from position on."""
+        self._rows.append((now, *state))
+
+    @property
+    def records(self) -> np.ndarray:
+        """All records so far, (n,) of RECORD."""
+        records = np.empty(len(self._rows), record_of(len(self._rows[0][1])) if self._rows else RECORD)
+        for name, column in zip(records.dtype.names or (), zip(*self._rows, strict=True), strict=False):
+            records[name] = column
+        return records
+
+
+class TruthLog:
+    """Writes the file at `path`. Raises ParameterError if it cannot be created."""
+
+    def __init__(self, path: str | Path) -> None:
+        try:
+            self._file = open(path, "wb", buffering=0)  # noqa: SIM115, open as long as the process runs
+        except OSError as error:
+            raise ParameterError("truth", str(path), f"a file that can be written ({error.strerror})") from None
+        self._rows = bytearray()
+        self._record: np.dtype | None = None
+        self._offset = 0.0  # wall clock minus simulated time, s
+        self._flushed = 0.0
+
+    def synchronise(self, now: float) -> None:
+        """Note that the simulated time `now` (s) is the present time."""
+        self._offset = time.time() - now
+
+    def note(self, now: float, *state: Any) -> None:
+        """Append the `state` of the arm at the simulated time `now` (s): the fields of RECORD from position on."""
+        stamp = now + self._offset
+        self._record = self._record or record_of(len(state[0]))
+        self._rows += np.array((stamp, *state), self._record).tobytes()
+        if abs(stamp - self._flushed) >= FLUSH_PERIOD:
+            self._flushed = stamp
+            self._file.write(self._rows)
+            self._rows.clear()
+
 
 MAX_CATCH_UP = 0.05  # s of physics simulated at once; after a longer stall the rest of the time is lost
 IDLE_PERIOD = 0.005  # s after which physics advances even without a frame

@@ -72,7 +72,7 @@ def driven(
     slow: float = SLOW,
     turning: bool = False,
 ) -> Driven:
-    """Return what the motors did in these records (sim/truth.py); at least one.
+    """Return what the motors did in these records (sim/device.py); at least one.
 
     motors: of the joints (n,), by default those of the paper's arm.
     stops: the lower and upper mechanical stops, (n,) rad each; None if none is hit.
@@ -165,7 +165,7 @@ def measure(
 ) -> Response:
     """Return the response to a fault at `fault_time` (wall clock, s) of a control loop with `period` s.
 
-    records: of sim/truth.py, from shortly before the fault on; at least one. unreached: joints (0..) whose motors no
+    records: of sim/device.py, from shortly before the fault on; at least one. unreached: joints (0..) whose motors no
     frame can reach. unpowered: joints that fall because their motors have no power; their speed does not count.
     steps_from: s after the fault from which on torque steps count, where the fault itself is a step.
     motors: as in `driven`.

@@ -15,11 +15,10 @@ from exo_gravity.core.numbers import JOINT_COUNT
 from exo_gravity.core.params import Param, param_of, params_of, table_for
 from exo_gravity.hardware.urdf_arm import read_urdf
 from exo_gravity.sim.arm import DEFAULT_LINKS, ArmConfig, JointConfig, SimulatedArm
-from exo_gravity.sim.device import SimulatedDevice
+from exo_gravity.sim.device import SimulatedDevice, TruthLog
 from exo_gravity.sim.motors import class_of, simulated
 from exo_gravity.sim.motors.ak import FIRMWARES, Firmware, Heat
 from exo_gravity.sim.trunk_motion import ImuConfig
-from exo_gravity.sim.truth import TruthLog
 from exo_gravity.sim.urdf import UrdfConfig
 
 # Parameters of the arm by the field of ArmConfig that owns each of them.
@@ -112,7 +111,7 @@ SIMULATOR = (
         "s",
         fixed=True,
     ),
-    Param("truth", "", "file for the arm's true motion at 1 kHz (exo_gravity/sim/truth.py); empty: none", fixed=True),
+    Param("truth", "", "file for the arm's true motion at 1 kHz (exo_gravity/sim/device.py); empty: none", fixed=True),
     Param("fault.unplugged", [False] * JOINT_COUNT, "motors without power"),
     Param("fault.unplugged_time", 0.0, "time until their power returns, motors off; 0: never", (0.0, 60.0), "s"),
     Param("fault.cable", [False] * JOINT_COUNT, "V3 boards with their cable plugged in, which ignore commands"),

@@ -22,14 +22,12 @@ from exo_gravity.core.safety.command import Efforts, State
 from exo_gravity.core.safety.limits import Limits
 from exo_gravity.hardware.can_port import message_of
 from exo_gravity.sim.controllers import DirectController, UnreliableController
-from exo_gravity.sim.device import SimulatedDevice
+from exo_gravity.sim.device import SimulatedDevice, TruthRecords, VirtualWearer
 from exo_gravity.sim.judge import Driven, driven
 from exo_gravity.sim.script import IDLE, TrialScript
 from exo_gravity.sim.trunk_motion import TrunkState
-from exo_gravity.sim.truth import TruthRecords
 from exo_gravity.sim.virtual_arm import TrunkReading, VirtualArm
 from exo_gravity.sim.virtual_time import Wire
-from exo_gravity.sim.virtual_wearer import VirtualWearer
 
 IMU_PERIOD = 0.01  # s
 START = 90.0  # s within which an arm without a fault is carried
@@ -52,7 +50,7 @@ class Rig(VirtualArm):
     settings: of the compensator that carries it.
     late: share of cycles and answers that are late by chance (`UnreliableController`).
 
-    compensator, controller: what carries it. truth: its motion (sim/truth.py) since it was last forgotten.
+    compensator, controller: what carries it. truth: its motion (sim/device.py) since it was last forgotten.
     imu_error: rad of pitch and roll that the IMU adds, as one that comes loose: its gyroscope agrees. imu_frozen: the
     reading that it repeats. imu_silent: whether it sends nothing. gyro_bias: rad/s of pitch that it adds: a
     gyroscope that reads exactly 0 counts as none. changes: of the state so far.

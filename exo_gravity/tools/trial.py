@@ -24,12 +24,12 @@ from typing import TYPE_CHECKING
 from exo_gravity import version
 from exo_gravity.core.errors import DataError, ExoGravityError, ParameterError
 from exo_gravity.core.params import params_of
+from exo_gravity.lab.bag.content import Session
 from exo_gravity.lab.inputs.parameter_file import packaged_config
 from exo_gravity.lab.packages import MissingPackageError
 from exo_gravity.lab.processes import stop_on_signals
 from exo_gravity.lab.report import video
 from exo_gravity.lab.trial.scripted import analysed, packaged_trials, read_script
-from exo_gravity.lab.trial.session import Session
 from exo_gravity.tools.cli import extras
 
 if TYPE_CHECKING:

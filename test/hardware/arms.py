@@ -28,9 +28,8 @@ from exo_gravity.hardware.can_port import ArmOnBus, CanPort, open_bus
 from exo_gravity.hardware.motor_bus import MotorBus
 from exo_gravity.sim import ArmConfig, SimulatedMotor
 from exo_gravity.sim.arm import DEFAULT_LINKS, SimulatedArm
-from exo_gravity.sim.device import SimulatedDevice
+from exo_gravity.sim.device import SimulatedDevice, TruthRecords
 from exo_gravity.sim.rig import ACTS, Rig
-from exo_gravity.sim.truth import TruthRecords
 from exo_gravity.sim.virtual_time import Wire
 
 from ..support import PARTS

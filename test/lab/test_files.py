@@ -14,12 +14,12 @@ from exo_gravity.core.params import values_of
 from exo_gravity.core.safety.limits import CAN_BRIDGE, CONFIRM
 from exo_gravity.core.trunk.params import IMU
 from exo_gravity.core.vocabulary import Source
+from exo_gravity.lab.bag.content import Session
 from exo_gravity.lab.inputs.arms import configured_arms, read_arm
 from exo_gravity.lab.inputs.parameter_file import load, packaged_config
 from exo_gravity.lab.parallel import ENDED, Outcome, in_processes
 from exo_gravity.lab.trial.offline import simulated_trials
 from exo_gravity.lab.trial.scripted import read_script
-from exo_gravity.lab.trial.session import Session
 from exo_gravity.lab.vocabulary import of_all, source_of
 from exo_gravity.sim.params import SIMULATOR
 from exo_gravity.sim.script import TrialScript

@@ -14,7 +14,7 @@ import yaml
 from exo_gravity.core.errors import ParameterError
 from exo_gravity.core.params import ROS_PARAMETERS
 from exo_gravity.hardware.network import restrict_to_localhost
-from exo_gravity.lab.inputs import ros_yaml
+from exo_gravity.lab.inputs import parameter_file
 from exo_gravity.nodes.ros.parameters import plain
 
 from ..support import CONFIG
@@ -69,11 +69,11 @@ def test_each_scalar_has_the_value_that_rcl_gives_it(rcl):
     drawn = (
         "".join(dice.choices("0123456789+-.eExXpaAfFnNiIyYoOsStTrRuUlL_:~", k=dice.randint(1, 6))) for _ in range(1000)
     )
-    texts = [text for text in (*WRITTEN, *drawn) if is_plain(text) and not ros_yaml.OCTAL.fullmatch(text)]
+    texts = [text for text in (*WRITTEN, *drawn) if is_plain(text) and not parameter_file.OCTAL.fullmatch(text)]
     assert len(texts) > 600 and set(WRITTEN) <= set(texts)
     lines = "\n".join(f"    p{number}: {text}" for number, text in enumerate(texts))
     text = f"/right/tried:\n  ros__parameters:\n{lines}\n"
-    ours, theirs = ros_yaml.read(text, "f")["/right/tried"], rcl(text)
+    ours, theirs = parameter_file.read(text, "f")["/right/tried"], rcl(text)
     both = {text: (ours[f"p{number}"], theirs[f"p{number}"]) for number, text in enumerate(texts)}
     assert not {text: values for text, values in both.items() if repr(values[0]) != repr(values[1])}  # NaN is NaN
 
@@ -81,9 +81,9 @@ def test_each_scalar_has_the_value_that_rcl_gives_it(rcl):
 @pytest.mark.parametrize("name", ["exo.yaml", "sim.yaml", "sim_both.yaml"])
 def test_a_packaged_file_and_what_the_launcher_makes_of_it_are_the_same_for_both(name, rcl):
     text = (CONFIG / name).read_text(encoding="utf-8")
-    ours = ros_yaml.read(text, name)
+    ours = parameter_file.read(text, name)
     for node, values in ours.items():
-        for given in (text, ros_yaml.text_of(ours)):
+        for given in (text, parameter_file.text_of(ours)):
             theirs = rcl(given.replace(f"{node}:", "/right/tried:"))
             assert all(repr(value) == repr(theirs[parameter]) for parameter, value in values.items())
 
@@ -92,8 +92,8 @@ def test_texts_that_look_like_numbers_or_truth_values_come_back_as_texts(rcl):
     texts = ("5e-1", "y", "off", "0012", "~", "a: b", "é", "", "1\n2")
     values: dict[str, Any] = {f"p{number}": text for number, text in enumerate(texts)}
     values |= {"list": ["on", "1"], "number": 1e-05, "whole": 3, "infinite": math.inf, "truth": False}
-    text = ros_yaml.text_of({"/right/tried": values})
-    assert ros_yaml.read(text, "f") == {"/right/tried": values}
+    text = parameter_file.text_of({"/right/tried": values})
+    assert parameter_file.read(text, "f") == {"/right/tried": values}
     theirs = rcl(text)
     assert all(repr(value) == repr(theirs[name]) for name, value in values.items())
 
@@ -134,7 +134,7 @@ REFUSED = {  # a file, what is said of it, and whether rcl refuses it too, inste
 @pytest.mark.parametrize(("text", "said", "by_rcl"), REFUSED.values(), ids=REFUSED)
 def test_what_nobody_means_is_refused_with_its_line(text, said, by_rcl, rcl):
     with pytest.raises((ParameterError, yaml.YAMLError), match=said):
-        ros_yaml.read(text, "f")
+        parameter_file.read(text, "f")
     if by_rcl:
         with pytest.raises(Exception, match="parse params file"):
             rcl(text)
@@ -144,4 +144,4 @@ def test_an_empty_mapping_at_which_rcl_ends_is_left_out_of_the_launchers_copy(rc
     text = f"{ENTRY}    can: {{interface: pcan, options: {{}}}}\n    b: 1\n"
     with pytest.raises(Exception, match="parse params file"):
         rcl(text)
-    assert rcl(ros_yaml.text_of(ros_yaml.read(text, "f"))) == {"can.interface": "pcan", "b": 1}
+    assert rcl(parameter_file.text_of(parameter_file.read(text, "f"))) == {"can.interface": "pcan", "b": 1}

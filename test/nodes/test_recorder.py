@@ -22,8 +22,8 @@ from sensor_msgs.msg import Imu, JointState
 from std_msgs.msg import Float64, String
 
 from exo_gravity import version
+from exo_gravity.lab.bag.content import Session
 from exo_gravity.lab.bag.reader import read_bag
-from exo_gravity.lab.trial.session import Session
 from exo_gravity.nodes.recorder.node import LiveLine
 from exo_gravity.nodes.ros.messages import to_nanoseconds
 from exo_gravity.nodes.ros.subscriptions import LATCHED

@@ -10,9 +10,9 @@ import pytest
 from exo_gravity.core.errors import ParameterError
 from exo_gravity.core.motors.ak import MIT
 from exo_gravity.core.motors.frames import ENTER
-from exo_gravity.sim import truth
+from exo_gravity.sim import device as device_module
+from exo_gravity.sim.device import RECORD, TruthLog
 from exo_gravity.sim.judge import driven, measure
-from exo_gravity.sim.truth import RECORD, TruthLog
 
 from ..support.simulated_device import joints_of, make_device
 from ..support.truth import Truth
@@ -138,7 +138,7 @@ def test_what_motors_did_to_the_arm_is_told_from_what_a_hand_gravity_or_a_stop_d
 
 
 def test_every_physics_step_is_logged_with_wall_time_motion_torque_damping_and_motor_state(tmp_path, monkeypatch):
-    monkeypatch.setattr(truth, "time", SimpleNamespace(time=lambda: 5000.0))
+    monkeypatch.setattr(device_module, "time", SimpleNamespace(time=lambda: 5000.0))
     device, log = make_device(), Truth(tmp_path / "truth.bin")
     device.truth = TruthLog(log.path)
     device.arm.reset((0.0, 1.0, 0.0, 0.0))

@@ -9,8 +9,8 @@ from collections.abc import Callable, Sequence
 
 from exo_gravity.core.numbers import NO_TORQUE
 from exo_gravity.sim import SimulatedDevice
+from exo_gravity.sim.device import VirtualWearer
 from exo_gravity.sim.script import Step, TrialScript
-from exo_gravity.sim.virtual_wearer import VirtualWearer
 
 Joints = Sequence[float]
 Behaviour = Callable[[float, Joints, Joints], Joints]

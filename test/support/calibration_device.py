@@ -27,8 +27,7 @@ from exo_gravity.lab.calibration.poses import Itinerary, guess_for, next_pose
 from exo_gravity.lab.calibration.tour import Tour, TourController, calibrator_table, line_of, side_of, tour_of
 from exo_gravity.lab.calibration.tracking import Observation, Station
 from exo_gravity.lab.inputs.arms import node_values
-from exo_gravity.lab.inputs.parameter_file import load
-from exo_gravity.lab.inputs.ros_yaml import text_of
+from exo_gravity.lab.inputs.parameter_file import load, text_of
 from exo_gravity.sim import ArmConfig, SimulatedArm, SimulatedDevice, SimulatedMotor
 from exo_gravity.sim.arm import DEFAULT_LINKS
 from exo_gravity.sim.params import device_of, simulator_table

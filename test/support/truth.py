@@ -1,5 +1,5 @@
 # Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
-"""Reads the truth log of a simulated device while it grows; exo_gravity/sim/truth.py describes the format."""
+"""Reads the truth log of a simulated device while it grows; exo_gravity/sim/device.py describes the format."""
 
 from bisect import bisect_left
 from pathlib import Path
@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from exo_gravity.core.numbers import JOINT_COUNT
-from exo_gravity.sim.truth import record_of
+from exo_gravity.sim.device import record_of
 
 
 class Truth:

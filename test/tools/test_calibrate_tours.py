@@ -30,8 +30,7 @@ from exo_gravity.lab.calibration.tracking import Observation
 from exo_gravity.lab.calibration.wearer import wearer_from
 from exo_gravity.lab.calibration.worn_arm import WornArm
 from exo_gravity.lab.inputs.arms import configured_arm, read_arm
-from exo_gravity.lab.inputs.parameter_file import load
-from exo_gravity.lab.inputs.ros_yaml import text_of
+from exo_gravity.lab.inputs.parameter_file import load, text_of
 from exo_gravity.lab.trial.analysis import Recording
 from exo_gravity.sim import ArmConfig, SimulatedArm
 from exo_gravity.sim.arm import DEFAULT_LINKS

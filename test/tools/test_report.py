@@ -28,7 +28,7 @@ from exo_gravity.core.arm.tilt import gravity_in_trunk
 from exo_gravity.core.arm.wearer import Wearer
 from exo_gravity.core.safety.command import FaultCode
 from exo_gravity.core.vocabulary import Source
-from exo_gravity.lab.bag.content import Event, NodeStatus
+from exo_gravity.lab.bag.content import Event, NodeStatus, Session
 from exo_gravity.lab.bag.reader import read_bag
 from exo_gravity.lab.inputs.arms import configured_arm
 from exo_gravity.lab.inputs.parameter_file import load
@@ -38,7 +38,6 @@ from exo_gravity.lab.report import cohort, html, study
 from exo_gravity.lab.report.trial_report import STAMPS, analyse, print_report, write
 from exo_gravity.lab.trial.analysis import HoldCriteria, Recording
 from exo_gravity.lab.trial.analysis import analyse as analysis_of
-from exo_gravity.lab.trial.session import Session
 
 from ..support import CONFIG, csv_rows
 from ..support import synthetic_bags as made

@@ -35,6 +35,7 @@ from exo_gravity.lab.bag.content import (
     Bag,
     Event,
     NodeStatus,
+    Session,
     arm_of,
     leaf,
 )
@@ -42,7 +43,6 @@ from exo_gravity.lab.bag.storage import FIELDS, TYPES, Decoder, JointArrays, Joi
 from exo_gravity.lab.inputs.arms import recorded_of
 from exo_gravity.lab.inputs.parameter_file import recorded_parameters
 from exo_gravity.lab.trial.analysis import CARRIED, Recording, ScriptedStep, Span
-from exo_gravity.lab.trial.session import Session
 
 SECOND = 1_000_000_000  # ns
 

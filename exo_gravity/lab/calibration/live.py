@@ -28,8 +28,7 @@ from exo_gravity.lab.calibration.tour import BRIDGE, of_arm
 from exo_gravity.lab.calibration.tracking import Observation
 from exo_gravity.lab.inputs.arms import ConfiguredArm
 from exo_gravity.lab.inputs.node_checks import check_start
-from exo_gravity.lab.inputs.parameter_file import load
-from exo_gravity.lab.inputs.ros_yaml import text_of
+from exo_gravity.lab.inputs.parameter_file import load, text_of
 from exo_gravity.lab.processes import Launcher, asking_on_terminal, stop_on_signals
 
 KEPT = ("can_bridge", "simulator")  # the arm's nodes that run during a calibration, with the shared /imu

@@ -22,8 +22,7 @@ from exo_gravity.core.motors.families import MOTORS
 from exo_gravity.hardware.urdf_arm import UrdfArm, read_urdf
 from exo_gravity.hardware.urdf_checks import robot_of
 from exo_gravity.lab.inputs.arms import read_arm
-from exo_gravity.lab.inputs.parameter_file import load
-from exo_gravity.lab.inputs.ros_yaml import scalar
+from exo_gravity.lab.inputs.parameter_file import load, scalar
 
 LARGEST_ANGLE = 3.1  # rad, of a joint without limits
 POSES = 2000  # at random, for gravity's largest torque

@@ -32,21 +32,19 @@ from exo_gravity.core.safety.limits import Limits
 from exo_gravity.core.vocabulary import NONE, TEXT, Source
 from exo_gravity.hardware.trunk_estimator import VQF, ImuSample, TrunkEstimator
 from exo_gravity.lab.bag import content
-from exo_gravity.lab.bag.content import BRIDGE, JOINT_STATE, STRING, Event, NodeStatus
+from exo_gravity.lab.bag.content import BRIDGE, JOINT_STATE, STRING, Event, NodeStatus, Session
 from exo_gravity.lab.bag.storage import TYPES
 from exo_gravity.lab.bag.writer import BagWriter, Message, offered_qos
 from exo_gravity.lab.inputs.arms import node_values, read_arm
 from exo_gravity.lab.inputs.parameter_file import load, node_of
 from exo_gravity.lab.trial.analysis import ARRAYS, CARRIED, Recording, ScriptedStep, Span
 from exo_gravity.lab.trial.run import Trial, TrialEnd
-from exo_gravity.lab.trial.session import Session
 from exo_gravity.sim.controllers import DirectController
-from exo_gravity.sim.device import SimulatedDevice
+from exo_gravity.sim.device import SimulatedDevice, VirtualWearer
 from exo_gravity.sim.params import device_of, imu_of, set_faults, simulator_table
 from exo_gravity.sim.script import IDLE, TRUNK_ACTIONS, TrialScript
 from exo_gravity.sim.trunk_motion import ImuConfig, SimulatedImu, TrunkState, measured_tilt
 from exo_gravity.sim.virtual_arm import TrunkReading, TrunkSensor, VirtualArm, resting
-from exo_gravity.sim.virtual_wearer import VirtualWearer
 
 NOT_OK = 2  # the level of an event, as diagnostic_msgs/DiagnosticStatus has it
 GRACE = 0.5  # s from the end of the script until the arm is let down

@@ -25,11 +25,10 @@ from exo_gravity.core.params import params_of
 from exo_gravity.core.safety.command import State
 from exo_gravity.core.safety.descent import DESCENT_TIMEOUT
 from exo_gravity.core.vocabulary import NONE
+from exo_gravity.lab.bag.content import Session
 from exo_gravity.lab.inputs.node_checks import check_nodes, check_start
-from exo_gravity.lab.inputs.parameter_file import load, stages
-from exo_gravity.lab.inputs.ros_yaml import text_of
+from exo_gravity.lab.inputs.parameter_file import load, stages, text_of
 from exo_gravity.lab.processes import Launcher, Stopping
-from exo_gravity.lab.trial.session import Session
 from exo_gravity.sim.script import Step, TrialScript
 
 SETTLING = 0.5  # s between letting go and the position from which drift is measured

@@ -31,9 +31,8 @@ from std_msgs.msg import String
 from exo_gravity import version
 from exo_gravity.core.safety.descent import DESCENT_TIMEOUT
 from exo_gravity.lab.bag import content
-from exo_gravity.lab.bag.content import PARAMETERS, STATES, arm_of, leaf
+from exo_gravity.lab.bag.content import PARAMETERS, STATES, Session, arm_of, leaf
 from exo_gravity.lab.packages import extras
-from exo_gravity.lab.trial.session import Session
 from exo_gravity.nodes.others import OtherNodes, status_values
 from exo_gravity.nodes.ros.parameters import declare
 from exo_gravity.nodes.ros.run import run

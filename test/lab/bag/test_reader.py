@@ -25,12 +25,11 @@ from rosbags.interfaces import Nodetype
 from rosbags.rosbag2 import CompressionMode, StoragePlugin
 
 from exo_gravity.core.errors import DataError
-from exo_gravity.lab.bag.content import NodeStatus
+from exo_gravity.lab.bag.content import NodeStatus, Session
 from exo_gravity.lab.bag.reader import read_bag
 from exo_gravity.lab.bag.storage import Decoder, Messages
 from exo_gravity.lab.report.trial_report import analyse
 from exo_gravity.lab.trial.analysis import ARRAYS, in_blocks
-from exo_gravity.lab.trial.session import Session
 
 from ...support import synthetic_bags as made
 

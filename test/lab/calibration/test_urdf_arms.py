@@ -29,8 +29,7 @@ from exo_gravity.lab.calibration.tracking import Observation
 from exo_gravity.lab.calibration.wearer import WEARER, wearer_from
 from exo_gravity.lab.calibration.worn_arm import WornArm
 from exo_gravity.lab.inputs.arms import ConfiguredArm, configured_arm, read_arm
-from exo_gravity.lab.inputs.parameter_file import load, packaged_config
-from exo_gravity.lab.inputs.ros_yaml import text_of
+from exo_gravity.lab.inputs.parameter_file import load, packaged_config, text_of
 
 from ...support.calibration_device import player_of
 from ...support.chains import random_chain
