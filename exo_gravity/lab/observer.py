@@ -85,21 +85,21 @@ class WearerEstimate(NamedTuple):
 class MomentumObserver:
     """The observer of one arm. `update` takes 0.06 ms of arithmetic; any rate from 50 Hz on does."""
 
-    def __init__(self, settings: Settings, tuning: ObserverTuning = OBSERVER) -> None:
-        s, self._tuning = settings, tuning
+    def __init__(self, settings: Settings) -> None:
+        s, count = settings, len(settings.loaded.scale)
         self._error = s.model_error
         self._whole = s.worn(s.loaded)
-        self._gain, count = s.loaded.gain.tolist(), len(s.loaded.scale)
+        self._gain = s.loaded.gain.tolist()
         self._wearer, self._tissue = s.worn(s.robot.massless(s.loaded.gravity)), s.tissue
         self._links = s.loaded.worn_links(s.wearer_mass, s.wearer_cog)
         self._spring, self._joint_stiffness = s.joint_spring, s.joint_stiffness
         friction = s.terms.friction
         self._is_known = any(friction.coulomb)
-        self._coulomb = tuple(friction.coulomb) if self._is_known else for_joints(tuning.typical_coulomb, count, max)
+        self._coulomb = tuple(friction.coulomb) if self._is_known else for_joints(OBSERVER.typical_coulomb, count, max)
         self._viscous, self._load = for_joints(friction.viscous, count), for_joints(friction.load, count)
-        matrix = self._links.matrix(for_joints(tuning.reference, count, max))
+        matrix = self._links.matrix(for_joints(OBSERVER.reference, count, max))
         self._inertia: list[list[float]] = matrix.tolist()
-        code = [2.0 * tuning.bandwidth * tuning.velocity_code * math.hypot(*row) for row in self._inertia]
+        code = [2.0 * OBSERVER.bandwidth * OBSERVER.velocity_code * math.hypot(*row) for row in self._inertia]
         self._constant = [*map(math.hypot, self._error.torque, self._error.wearer_torque, code)]  # Nm
         self._deflection = for_joints(self._error.deflection, count, max)
         self._bending = [n for n, off in enumerate(self._deflection) if off]
@@ -126,12 +126,12 @@ class MomentumObserver:
         """
         theta, velocity, effort = joints
         theta = link_angles(theta, effort, self._joint_stiffness)
-        tuning, bandwidth = self._tuning, self._tuning.bandwidth
+        bandwidth = OBSERVER.bandwidth
         columns = [self._whole.torque(theta, axis) for axis in AXES]
         felt = tuple([tilt.magnitude * component for component in tilt.direction])
         gravity = [sum(map(operator.mul, felt, column)) for column in zip(*columns, strict=True)]
         dt, self._time = now - self._time, now
-        dt = dt if 0.0 < dt <= tuning.max_gap else math.inf  # of the first sample
+        dt = dt if 0.0 < dt <= OBSERVER.max_gap else math.inf  # of the first sample
         rubbing, friction = self._friction(velocity, effort)
         velocity, swing = self._of_links(dt, velocity)
         momentum, coriolis = self._links.momentum(theta, velocity, turning)
@@ -143,7 +143,7 @@ class MomentumObserver:
         still = (gravity_tilt or tilt)._replace(magnitude=1.0)
         worn = tuple(map(operator.mul, self._gain, self._wearer.torque(theta, still)))
         self._felt = low_passed(self._felt, felt, 1.0 - math.exp(-bandwidth * dt))
-        shaken = tuning.motion_share * math.dist(felt, self._felt)
+        shaken = OBSERVER.motion_share * math.dist(felt, self._felt)
         largest = [math.hypot(*column) for column in zip(*columns, strict=True)]  # gravity in any direction
         leaning = [(tilt.magnitude * most) ** 2 - held_up**2 for most, held_up in zip(largest, gravity, strict=True)]
         slow = map(operator.sub, momentum, self._slow)
@@ -155,8 +155,8 @@ class MomentumObserver:
             (shaken * most for most in largest),
             friction,
             swing,
-            (tuning.inertia_share * bandwidth * change for change in slow),
-            (tuning.lag_share * late for late in lag),
+            (OBSERVER.inertia_share * bandwidth * change for change in slow),
+            (OBSERVER.lag_share * late for late in lag),
         )
         independent = tuple(map(math.hypot, *parts))
         deviation = tuple([math.hypot(own, self._error.wearer * w) for own, w in zip(independent, worn, strict=True)])
@@ -167,7 +167,7 @@ class MomentumObserver:
 
         dt: s since the last sample; infinite: as if the arm did not accelerate. unexplained: (n,) Nm from now on.
         """
-        bandwidth = self._tuning.bandwidth
+        bandwidth = OBSERVER.bandwidth
         share = 1.0 - math.exp(-bandwidth * dt)
         if math.isinf(dt):
             self._momentum, self._input = momentum, unexplained
@@ -188,17 +188,16 @@ class MomentumObserver:
 
         dt: s since the last sample, infinite for the first. velocity: (n,) rad/s, of the motors.
         """
-        tuning = self._tuning
-        share = 1.0 - math.exp(-tuning.smooth * dt)
+        share = 1.0 - math.exp(-OBSERVER.smooth * dt)
         self._passed = low_passed(self._passed, velocity, share)
         self._passed_twice = low_passed(self._passed_twice, self._passed, share)
         smooth = [2.0 * once - twice for once, twice in zip(self._passed, self._passed_twice, strict=True)]
-        off = [max(0.0, (v - slow) ** 2 - tuning.least_swing**2) for v, slow in zip(velocity, smooth, strict=True)]
-        self._swing = low_passed(self._swing, off, 1.0 - math.exp(-dt / tuning.swing_time))
-        left, whole = tuning.swing_share
+        off = [max(0.0, (v - slow) ** 2 - OBSERVER.least_swing**2) for v, slow in zip(velocity, smooth, strict=True)]
+        self._swing = low_passed(self._swing, off, 1.0 - math.exp(-dt / OBSERVER.swing_time))
+        left, whole = OBSERVER.swing_share
         swings = zip(self._swing, self._is_elastic, strict=True)
         size = [(left if is_elastic else whole) * math.sqrt(square) for square, is_elastic in swings]
-        error = [tuning.bandwidth * math.hypot(*map(operator.mul, row, size)) for row in self._inertia]
+        error = [OBSERVER.bandwidth * math.hypot(*map(operator.mul, row, size)) for row in self._inertia]
         columns = zip(velocity, smooth, self._is_elastic, strict=True)
         return [slow if is_elastic else v for v, slow, is_elastic in columns], error
 
@@ -210,8 +209,8 @@ class MomentumObserver:
             moving, coulomb = sliding(v), constant + load * abs(carried)
             whole = moving * (coulomb + viscous * abs(v))
             torque.append(-math.copysign(whole, v) if self._is_known else 0.0)
-            unsure = self._tuning.friction_share * whole if self._is_known else whole
-            deviation.append(math.hypot(unsure, (1.0 - moving) * self._tuning.sticking_share * coulomb))
+            unsure = OBSERVER.friction_share * whole if self._is_known else whole
+            deviation.append(math.hypot(unsure, (1.0 - moving) * OBSERVER.sticking_share * coulomb))
         return torque, deviation
 
 
@@ -450,12 +449,11 @@ class SupportAdaptation:
     None if nothing is estimated; known without an adaptation, too.
     """
 
-    def __init__(self, tuning: AdaptationTuning = ADAPTATION) -> None:
+    def __init__(self) -> None:
         self.support = 0.0
         self.requested: float | None = None
         self.problem = ""
         self.shares: Shares | None = None
-        self._tuning = tuning
         self._running = RunningShare()
         self._time = self._due = -math.inf  # s
         self._theta: Sequence[float] | None = None
@@ -493,8 +491,8 @@ class SupportAdaptation:
             sunk = self._sunk(dt, joints, estimate.weight, 1.0 - in_force)
         else:
             self.problem = "the wearer's torque is not known"
-        rise = self._tuning.rise
-        fall = rise if self.problem else (self.support - settings.support) / self._tuning.memory
+        rise = ADAPTATION.rise
+        fall = rise if self.problem else (self.support - settings.support) / ADAPTATION.memory
         self.support = max(settings.support, min(1.0, self.support + dt * (rise * sunk - fall)))
         self.requested = in_force
         if now >= self._due and abs(self.support - in_force) >= REQUEST.least_change:
@@ -506,21 +504,20 @@ class SupportAdaptation:
         asked: share of their arm that is left to the wearer.
         """
         theta, velocity = joints
-        tuning = self._tuning
         moved = map(operator.sub, theta, self._theta or theta)
-        self._theta, part = theta, dt / (tuning.mean + dt)
+        self._theta, part = theta, dt / (ADAPTATION.mean + dt)
         size = math.hypot(*weight)
         rise = sum(map(operator.mul, weight, moved)) / max(size, SHARE.least_weight)
-        is_moved = max(map(abs, velocity)) > tuning.reach
+        is_moved = max(map(abs, velocity)) > ADAPTATION.reach
         self._speed = 0.0 if is_moved else self._speed + part * (rise / dt - self._speed)
         self.problem = ""
         share, deviation = self.shares.whole if self.shares else (math.nan, math.nan)
         if math.isnan(share):  # the arm hangs
             return 0.0
         band = COVER * float(deviation)
-        if band > tuning.widest:
+        if band > ADAPTATION.widest:
             self.problem = f"the wearer's share is known to +-{100.0 * band:.0f} % only"
-        sunk = max(-tuning.lift, min(1.0, -self._speed / tuning.full))
+        sunk = max(-ADAPTATION.lift, min(1.0, -self._speed / ADAPTATION.full))
         return sunk if sunk < 0.0 or (not self.problem and -band < share < asked + band) else 0.0
 
 
@@ -546,27 +543,25 @@ CONTACT = ContactTuning()
 class ContactWatch:
     """Counts the contacts of one arm. last: time in s, joint and Nm of the newest, None before the first."""
 
-    def __init__(self, tuning: ContactTuning = CONTACT) -> None:
+    def __init__(self) -> None:
         self.count = 0
         self.last: tuple[float, int, float] | None = None
-        self._tuning = tuning
         self._slow: Torque = ()
         self._time = self._touched = -math.inf  # s
 
     def update(self, now: float, estimate: WearerEstimate) -> None:
         """Take the estimate at `now` s."""
-        tuning = self._tuning
         dt, self._time = now - self._time, now
-        if not 0.0 <= dt <= tuning.followed:
+        if not 0.0 <= dt <= CONTACT.followed:
             self._slow, dt = estimate.torque, 0.0
-        self._slow = low_passed(self._slow, estimate.torque, dt / tuning.followed)
+        self._slow = low_passed(self._slow, estimate.torque, dt / CONTACT.followed)
         jumps = list(map(operator.sub, estimate.torque, self._slow))
-        least = for_joints(tuning.least, len(jumps), max)
+        least = for_joints(CONTACT.least, len(jumps), max)
         is_shown = np.abs(estimate.torque) > COVER * np.array(estimate.deviation)
         sizes = is_shown * np.abs(jumps) / least
         joint = int(np.argmax(sizes))
         if sizes[joint] > 1.0:
-            if now - self._touched > tuning.pause:
+            if now - self._touched > CONTACT.pause:
                 self.count, self.last = self.count + 1, (now, joint, jumps[joint])
             self._touched = now
 

@@ -53,8 +53,7 @@ class VirtualArm:
     rate: cycles of the loop per s.
     wire: the bus; by default one of its own, whose clock is at 0 s.
     ports, played: of each joint's motor, and how the device is connected; by default one port for all, on `wire`.
-    look: called after every step of the device, at least every 2 ms.
-    note, hand_over: those of `MotorBus` and `ControlLoop`.
+    note: that of `MotorBus`.
 
     clock, wire, loop, safety, bus: what runs the arm.
     """
@@ -69,18 +68,16 @@ class VirtualArm:
         wire: Wire | None = None,
         ports: Sequence[CanPort | None] | None = None,
         played: Played | None = None,
-        look: Callable[[], None] | None = None,
         note: Callable[[Command], None] = lambda command: None,
-        hand_over: Callable[[str], bool] = lambda reason: False,
     ) -> None:
         self.device = device
         self.wire = wire or Wire(start=0.0)
         self.clock = self.wire.clock
-        self._played = played or (self.wire.play(device, look) if look else self.wire.play(device, tick=None))
+        self._played = played or self.wire.play(device, tick=None)
         if ports is None:
             ports = [CanPort(self.wire.open(), self.clock, self.wire.open, any(device.is_fd))] * len(motors)
         self.bus = MotorBus(ports, motors, note=note, clock=self.clock)
-        self.loop = ControlLoop(self.bus, replace(limits, start_pose=HANGING), 1.0 / rate, controller, hand_over)
+        self.loop = ControlLoop(self.bus, replace(limits, start_pose=HANGING), 1.0 / rate, controller)
         self.safety = self.loop.safety
 
     @property

@@ -297,7 +297,6 @@ class EchoingBus(VirtualBus, UdpMulticastBus):
 class Played:
     """A simulated device on `wire`, whose time passes with the clock's.
 
-    look: called after every step of the device.
     tick: s between two steps at most; None to step only before a frame is answered.
     joints: whose motors are on this wire, from 0 on; () for all.
     first: what plays the device's other motors on another wire, and lets its time pass.
@@ -307,12 +306,11 @@ class Played:
         self,
         wire: Wire,
         device: SimulatedDevice,
-        look: Callable[[], None],
         tick: float | None,
         joints: Sequence[int] = (),
         first: Played | None = None,
     ) -> None:
-        self._wire, self._device, self._look, self._first = wire, device, look, first
+        self._wire, self._device, self._first = wire, device, first
         self._joints = joints or range(len(device.motors))
         self._last = wire.clock.monotonic()
         self._random = random.Random(0)
@@ -341,7 +339,6 @@ class Played:
         elif now > self._last:
             self._device.advance(now - self._last)
             self._last = now
-            self._look()
 
     def _report(self, joint: int) -> None:
         self.catch_up()
@@ -393,13 +390,12 @@ class Wire:
     def play(
         self,
         device: SimulatedDevice,
-        look: Callable[[], None] = lambda: None,
         tick: float | None = TICK,
         joints: Sequence[int] = (),
         first: Played | None = None,
     ) -> Played:
         """Connect a simulated device; see `Played`."""
-        return Played(self, device, look, tick, joints, first)
+        return Played(self, device, tick, joints, first)
 
     def break_down(self, error: Exception) -> None:
         """Let every end that is open now raise `error` from now on."""
