@@ -137,9 +137,9 @@ class Launcher:
 
     on_line(node, line) is called with each line that a node prints. only: shell patterns of the nodes to start; ()
     starts all. more: nodes to start in addition to those of the file, with their default parameters. namespace: '/lab'
-    in front of every node and of the IMU's topics. log_level: of every node. one_process: whether can_bridge and
-    compensator of an arm share one. remaps: of topics, 'from:=to', for every node. check(nodes): may refuse the nodes
-    that are to start, by an exception. Raises ParameterError, MissingPackageError.
+    in front of every node and of the IMU's topics. one_process: whether can_bridge and compensator of an arm share one.
+    arguments: of ROS, for every node. check(nodes): may refuse the nodes that are to start, by an exception. Raises
+    ParameterError, MissingPackageError.
 
     params: what the nodes read: a copy of the file as the tools have read it, so that nothing depends on two readers.
     asking: the bridges whose start asks a person whether the arm hangs as it is drawn.
@@ -154,9 +154,8 @@ class Launcher:
         only: Sequence[str] = (),
         more: Sequence[str] = (),
         namespace: str = "",
-        log_level: str = "info",
         one_process: bool = False,
-        remaps: Sequence[str] = (),
+        arguments: Sequence[str] = (),
         check: Callable[[Nodes], object] = lambda nodes: None,
     ) -> None:
         nodes = {**{node: {} for node in more}, **load(params)}
@@ -177,7 +176,7 @@ class Launcher:
         except OSError as error:
             expected = f"a folder with room for a copy of the parameters ({error.strerror or error})"
             raise ParameterError("TMPDIR", os.environ.get("TMPDIR", "/tmp"), expected) from None
-        self._namespace, self._log_level, self._remaps, self._on_line = namespace, log_level, remaps, on_line
+        self._namespace, self._arguments, self._on_line = namespace, arguments, on_line
         pairs = {bridge: f"{bridge.rpartition('/')[0]}/compensator" for bridge in bridges if one_process}
         # The compensator that shares the process of its can_bridge
         self._guests = {bridge: guest for bridge, guest in pairs.items() if guest in names}
@@ -195,10 +194,9 @@ class Launcher:
         full = f"{self._namespace}{node}"
         space, name = full.rsplit("/", 1)
         topics = [f"{topic}:={self._namespace}{topic}" for topic in ABSOLUTE_TOPICS if self._namespace]
-        rules = (f"__node:={name}", f"__ns:={space or '/'}", *topics, *self._remaps)
+        rules = (f"__node:={name}", f"__ns:={space or '/'}", *topics)
         remaps = [word for rule in rules for word in ("-r", rule)]
-        given = ["--params-file", str(self.params), "--log-level", self._log_level]
-        return ["--ros-args", *remaps, "--enclave", full, *given]
+        return ["--ros-args", *remaps, "--enclave", full, "--params-file", str(self.params), *self._arguments]
 
     def start(self) -> None:
         """Start every node."""

@@ -87,6 +87,7 @@ def main(args: Sequence[str] | None = None) -> None:
     if os.environ.get("EXO_GRAVITY_SUPERVISED"):  # by `ros2 launch`, which holds our standard input open
         threading.Thread(target=_stop_with_parent, args=(stopping,), daemon=True).start()
     space, restarts = options.namespace.strip("/"), deque([-math.inf] * 3, maxlen=3)  # the latter in monotonic s
+    remaps = [word for rule in options.remap for word in ("-r", rule)]
     restrict_to_localhost()
     try:
         while True:
@@ -96,9 +97,8 @@ def main(args: Sequence[str] | None = None) -> None:
                 options.only,
                 ["/panel"] if options.panel else [],
                 f"/{space}" if space else "",
-                options.log_level,
                 options.one_process,
-                options.remap,
+                ["--log-level", options.log_level, *remaps],
                 check_start,
             )
             if sentence := localhost_notice():
