@@ -120,7 +120,11 @@ class PlayedArms:
         effort = [0.8 * math.sin(0.5 * now + n) for n in range(len(names))]
         state, fault = self.states[name], self.faults.get(name, "none")
         values = {"state": state, "fault": fault, "rate (Hz)": "250.0", "age of efforts (ms)": "4.1"}
-        values |= {"limits acting": "none", "damped by": "still joint (elbow)", **{f"{joint} temperature (degC)": "31" for joint in names}}
+        values |= {
+            "limits acting": "none",
+            "damped by": "still joint (elbow)",
+            **{f"{joint} temperature (degC)": "31" for joint in names},
+        }
         values["pose to confirm (deg)"] = self.asked.get(name, "none")
         values["resume"] = "possible" if fault == "command_stale" else "has_cause"
         values |= {
