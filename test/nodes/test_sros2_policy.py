@@ -67,7 +67,7 @@ def nodes_with_recorded_parameters(bag):
     """Yield the nodes whose parameters are in a recording, which may still grow."""
     with suppress(DataError):  # while it is empty
         for rows in Storage(bag).rows(lambda topic, _: topic == "/recorder/parameters"):
-            for data in rows.batch.messages():
+            for data in rows.data:
                 message = get_typestore(Stores.ROS2_JAZZY).deserialize_cdr(data, "std_msgs/msg/String")
                 yield message.data.partition(":")[0].strip()
 

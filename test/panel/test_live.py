@@ -73,7 +73,7 @@ def test_a_session_is_recorded_and_reported_an_arm_put_back_and_the_panels_death
     arrays = [
         STORE.deserialize_cdr(data, "diagnostic_msgs/msg/DiagnosticArray")
         for rows in Storage(recording / "bag").rows(lambda topic, _: topic == "/diagnostics")
-        for data in rows.batch.messages()
+        for data in rows.data
     ]
     noted = [status.message for array in arrays for status in array.status if status.name == "panel"]
     assert any("page 1: let down: done" in text for text in noted), noted

@@ -390,7 +390,7 @@ class Storage:
             try:
                 while rows := cursor.fetchmany(BLOCK):
                     for topic, arrival, message in rows:
-                        if isinstance(arrival, int) and isinstance(message, bytes):
+                        if topic in chosen and isinstance(arrival, int) and isinstance(message, bytes):
                             self._take(chosen[topic], arrival, message)
                         else:
                             self.damaged += 1
