@@ -16,12 +16,12 @@ from statistics import NormalDist
 from typing import NamedTuple
 
 import numpy as np
-from scipy.optimize import lsq_linear
 
 from exo_gravity.core.arm.tilt import SIDES, Tilt
 from exo_gravity.core.numbers import COVER
 from exo_gravity.lab.calibration.moment_model import TURNS, MomentModel
-from exo_gravity.lab.calibration.pose_fit import Rows, Solution, layout_of, rows_at
+from exo_gravity.lab.calibration.pose_fit import Rows, unmeasured
+from exo_gravity.lab.calibration.poses import PRIOR
 
 POSES = 100  # new ones, at random
 LEAN = 0.15  # rad, standard deviation of the trunk's pitch and roll in these
@@ -35,35 +35,52 @@ class InFile(NamedTuple):
     error: np.ndarray  #: (n,) Nm; COVER times this contains 95 % of the errors of its torque in new poses
 
 
-def held(model: MomentModel, solution: Solution, misfit: np.ndarray) -> InFile:
+def held(
+    model: MomentModel, rows: Rows, unknowns: np.ndarray, covariance: np.ndarray, known: np.ndarray, misfit: np.ndarray
+) -> InFile:
     """Return what the file holds of a fit, and how well.
 
+    rows: that were fitted. unknowns, covariance: (count,) and (count, count), of the fit.
+    known: (k,), whether the poses show a moment; the others stay as they are, as unsure as before a tour.
     misfit: (n,) Nm as commanded, root mean square of what noise does not explain of the residuals.
     """
-    at, unknowns = layout_of(model), solution.unknowns
-    new, scale = _new_poses(model), np.exp(unknowns[at.scale])
+    at, scale = rows.layout, np.exp(unknowns[rows.layout.scale])
+    unknowns, covariance = unknowns.copy(), covariance.copy()
+    for index in np.flatnonzero(~known):
+        unknowns[index] = model.moments[index]
+        covariance[index] = covariance[:, index] = 0.0  # what the file has is not from this fit
+        covariance[index, index] = (PRIOR.share * abs(model.moments[index]) + PRIOR.moment) ** 2
+    new = _new_poses(model, rows.start)
     kept = unknowns.copy()
     kept[at.offset] *= unknowns[at.spring] > 0.0
     kept[at.tilt] *= model.keeps_tilt
     turns = kept[at.turn].reshape(-1, TURNS)
     turns[:, 1:] *= model.is_described
-    free = np.flatnonzero(~solution.hidden[at.moment])
-    lowest = np.full(at.moment.stop, -np.inf)
-    lowest[list(model.at_least_0)] = 0.0
+    free = np.flatnonzero(known)
     left = scale * (new.predicted(unknowns) - new.predicted(kept))
-    by_moments = (scale[:, None] * new.jacobian(kept))[..., free].reshape(-1, len(free))
-    kept[free] += lsq_linear(by_moments, left.ravel(), (lowest[free] - kept[free], np.inf)).x
-    left = scale * (new.predicted(unknowns) - new.predicted(kept))
+    by_moments = scale[:, None] * new.jacobian(kept)[..., at.moment]
+    while True:
+        moments = kept[at.moment].copy()
+        moments[free] += np.linalg.lstsq(by_moments[..., free].reshape(-1, len(free)), left.ravel(), rcond=None)[0]
+        below = [index for index in free if index in model.at_least_0 and moments[index] < 0.0]
+        if not below:
+            break
+        left += by_moments[..., below] @ kept[below]  # as if they were 0
+        kept[below] = 0.0
+        free = np.setdiff1d(free, below)
+    left -= by_moments @ (moments - kept[at.moment])
+    kept[at.moment] = moments
     jacobian = scale[:, None] * new.jacobian(unknowns)
-    variance = np.einsum("qnt,tu,qnu->qn", jacobian, solution.covariance, jacobian, optimize=True)
+    variance = np.einsum("qnt,tu,qnu->qn", jacobian, covariance, jacobian, optimize=True)
     errors = left + np.sqrt(variance + (scale * misfit) ** 2) * NORMAL[:, None, None]
     return InFile(kept, np.quantile(np.abs(errors), 0.95, axis=(0, 1)) / COVER)
 
 
-def _new_poses(model: MomentModel) -> Rows:
+def _new_poses(model: MomentModel, start: np.ndarray) -> Rows:
     """Return poses at random without a weight, under tilts of the trunk if an IMU measures them."""
     random = np.random.default_rng(2)
     theta = random.choice(model.suggested, POSES)
     leans = random.normal(0.0, LEAN * model.keeps_tilt, (POSES, 2)).tolist()
     down = np.array([model.down(Tilt.of(SIDES[0], pitch, roll)) for pitch, roll in leans])
-    return rows_at(model, theta, down, model.turned(theta))
+    rows = unmeasured(model, theta, down, start)
+    return rows._replace(turned=model.turned(theta))

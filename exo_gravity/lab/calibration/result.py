@@ -172,7 +172,7 @@ def _comment(indent: str, note: str) -> str:
 def remainders(
     found: Identified, arm: ConfiguredArm, model: MomentModel, poses: Sequence[Observation]
 ) -> tuple[np.ndarray, ...]:
-    """Return measured minus predicted torque (m, n) in Nm as commanded.
+    """Return measured minus predicted torque (m, n) in Nm as commanded, and which of the poses (m,) were used.
 
     Predicted by the old file; by the new one, which holds less than the fit (`held`); and by a result that was found
     without that pose.
@@ -182,7 +182,8 @@ def remainders(
     rows = model.rows(theta, direction)
     springs = joint_spring_of(arm.compensator).torques(theta)
     old = measured - np.einsum("njk,nk->nj", rows, model.moments + loads) - springs
-    return old, found.remainder, found.held_out + found.remainder - found.residual
+    used = ~np.isin(np.arange(len(poses)), [index for index, _ in found.rejected])
+    return old, found.remainder, found.held_out + found.remainder - found.residual, used
 
 
 def page_of(result: CalibrationResult, command: str, params: str, today: datetime.date | None = None) -> str:
@@ -209,15 +210,16 @@ def _sections(result: CalibrationResult) -> Iterator[str]:
         caption = f"{line}. What remains in each pose: inside the band, friction holds the arm; outside, it creeps."
         yield html.picture(html.png_of(torque_figure(found, *of), DPI), caption)
         yield html.bullets("Drift to expect", _drift(found, *remainders(found, *of)))
-        yield html.bullets("What these poses do not show", unknown)
+        values = " ".join(f"{value:.3g}" for value in found.singular_values)
+        yield html.bullets("What these poses do not show", [*unknown, f"Singular values of the information: {values}"])
     if result.curves and result.arm:
         caption = "Friction over speed, half the difference between both directions."
         yield html.picture(html.png_of(friction_figure(result.curves, result.arm.joint_names), DPI), caption)
 
 
-def _drift(found: Identified, old: np.ndarray, _: np.ndarray, held_out: np.ndarray) -> Iterator[str]:
+def _drift(found: Identified, old: np.ndarray, _: np.ndarray, held_out: np.ndarray, used: np.ndarray) -> Iterator[str]:
     """Yield in how many poses the arm creeps, with all of the measured friction and with little of it."""
-    wrong = np.abs((old, held_out))
+    wrong = np.abs((old, held_out))[:, used]
     for share, friction in ((1.0, "the friction measured"), (SMALL_FRICTION, f"{SMALL_FRICTION:g} times that")):
         before, after = np.any(wrong > share * found.friction, axis=2).sum(axis=1)
         count = f"in {before} of {wrong.shape[1]} poses with the old file, in {after} with the new"
@@ -229,20 +231,21 @@ def torque_figure(found: Identified, arm: ConfiguredArm, model: MomentModel, pos
     count, colours = len(arm.joint_names), joint_colours(len(arm.joint_names))
     figure = Figure(figsize=(FIGURE_WIDTH, ROW_HEIGHT * count), layout="constrained")
     theta, _, effort, spread = columns(poses)
-    remaining = remainders(found, arm, model, poses)
+    *remaining, used = remainders(found, arm, model, poses)
     numbers = np.arange(1, len(poses) + 1)
     for joint, (left, right) in enumerate(figure.subplots(count, 2, width_ratios=(1.0, 3.0), squeeze=False)):
         colour, friction = colours[joint], found.friction[joint]
         measured, old, new, held_out = (column[:, joint] for column in (effort, *remaining))
         left.axline((0.0, 0.0), slope=1.0, color=FAINT, lw=0.8, zorder=0)
         left.plot(measured, measured - old, "o", ms=4.5, mfc="none", color=INK)
-        left.plot(measured, measured - new, "o", ms=4.5, color=colour)
+        left.plot(measured[used], (measured - new)[used], "o", ms=4.5, color=colour)
+        left.plot(measured[~used], (measured - new)[~used], "x", ms=6, color=INK)
         left.set(aspect="equal", adjustable="datalim", ylabel="Predicted (Nm)")
         right.axhspan(-friction, friction, color=HOLD_COLOUR, lw=0, zorder=0, label="friction holds")
         right.axhline(0.0, color=FAINT, lw=0.6, zorder=0)
-        right.plot(numbers - 0.12, old, "o", ms=5, mfc="none", color=INK, label="old file")
+        right.plot(numbers[used] - 0.12, old[used], "o", ms=5, mfc="none", color=INK, label="old file")
         right.errorbar(
-            numbers + 0.12, held_out, 2.0 * spread[:, joint], fmt="o", ms=4.5, lw=1.2, color=colour,
+            numbers[used] + 0.12, held_out[used], 2.0 * spread[used, joint], fmt="o", ms=4.5, lw=1.2, color=colour,
             label="new file; right: this pose held out, ± 2 standard errors",
         )  # fmt: skip
         right.set(xlim=(0.4, len(numbers) + 0.6), ylabel="Remainder (Nm)")
@@ -251,7 +254,8 @@ def torque_figure(found: Identified, arm: ConfiguredArm, model: MomentModel, pos
         _finish(right, colour)
     left.set_xlabel("Measured (Nm)")
     rows = [[str(n), *(f"{angle:.0f}" for angle in pose)] for n, pose in zip(numbers, np.degrees(theta), strict=True)]
-    right.set_xticks(numbers, list(map("\n".join, rows)), fontsize=8)
+    ticks = ["\n".join(row if kept else [*row, "left out"]) for row, kept in zip(rows, used, strict=True)]
+    right.set_xticks(numbers, ticks, fontsize=8)
     right.set_xlabel("Pose, with its angles in degrees")
     figure.legend(*right.get_legend_handles_labels(), loc="outside upper center", ncols=3, frameon=False, fontsize=9)
     return figure

@@ -190,8 +190,9 @@ def _changes(arm: ConfiguredArm, model: MomentModel, found: Identified, scale: l
         *_temperature_changes(arm, found),
         *_spring_changes(arm, found),
     ]
-    note = "Nm, in poses that no tour visited"
-    changes.append(Change(node, "model_error.torque", found.torque_error.round(4).tolist(), note))
+    if np.all(np.isfinite(found.held_out).any(axis=0)):
+        note = "Nm, in poses that no tour visited"
+        changes.append(Change(node, "model_error.torque", found.torque_error.round(4).tolist(), note))
     if not found.relative:
         known = np.isfinite(found.scale_error)
         share = np.where(known, found.scale_error / found.scale, for_joints(ModelError().scale, len(scale), max))
@@ -249,10 +250,10 @@ def _lines(arm: ConfiguredArm, found: Identified) -> Iterator[str]:
     """Yield what the parameter file does not hold, in sentences."""
     for name, slide, offset in zip(arm.joint_names, found.friction, found.offset, strict=True):
         yield f"{name}: friction {slide:.2f} Nm, offset {offset:+.3f} Nm"
-    off = np.abs(found.held_out)
-    pose, joint = np.unravel_index(np.argmax(off), off.shape)
-    which = f"pose {pose + 1}, {arm.joint_names[joint]}"
-    yield f"largest torque error of a pose that was left out: {off.max():.3f} Nm, {which}"
+    worst = float(np.nanmax(np.abs(found.held_out), initial=0.0))
+    yield f"largest torque error of a pose that was left out: {worst:.3f} Nm"
+    for index, reason in found.rejected:
+        yield f"pose {index + 1} was not used: {reason}"
     yield from found.unknown
 
 

@@ -77,9 +77,9 @@ def test_the_prediction_of_a_pose_is_that_of_a_fit_without_it_and_nearly_as_good
 def test_without_a_weight_moments_and_scales_are_relative_but_the_commanded_torque_is_right():
     device = Device(3)
     found = identify(device.tour(bare=12, weighed=0), PAPERS)
-    assert found.relative and "common factor" in found.unknown[0]
+    assert found.relative and "common factor" in found.unknown[0] and found.singular_values[-1] < 1e-3
     weighed = identify(Device(3).tour(), PAPERS)
-    assert not weighed.relative and "common factor" not in weighed.unknown[0]
+    assert not weighed.relative and weighed.singular_values[-1] > 1.0 and "common factor" not in weighed.unknown[0]
     assert np.prod(found.scale[1:]) == pytest.approx(1.0, abs=1e-5)
     factor = found.moments[1] / device.moments[1]
     assert factor == pytest.approx(np.prod(device.scale[1:]) ** (-1.0 / 3.0), rel=0.01)
@@ -99,13 +99,13 @@ def test_with_an_upright_stand_joint_1_is_not_known_and_said_to_be_and_of_equal_
 
 @pytest.mark.parametrize(
     ("seed", "tilt", "error"),
-    [(30, (0.05, 0.05), 0.002), pytest.param(31, (0.003, 0.002), 0.02, marks=pytest.mark.thorough)],
+    [(30, (0.05, 0.05), 0.002), pytest.param(31, (0.003, 0.002), np.inf, marks=pytest.mark.thorough)],
 )
 def test_the_first_moment_is_never_negative_and_its_error_stays_honest(seed, tilt, error):
     device = Device(seed)
     device.moments[0] = -0.003
     found = identify(device.tour(Tilt.of("right", *tilt).direction), PAPERS)
-    assert 0.0 <= found.moments[0] < device.moments[0] + 2.0 * found.error[0] and found.error[0] >= error
+    assert found.moments[0] == (0.0 if error < np.inf else PAPERS.moments[0]) and found.error[0] >= error
 
 
 def test_a_zero_that_is_off_looks_like_a_moment_across_the_link_and_the_torque_is_right_all_the_same():
@@ -224,7 +224,7 @@ def test_the_papers_derivatives_by_turns_are_pinocchios():
 
 def test_zeros_of_a_jig_are_kept():
     found = identify(Device(5).tour(), PAPERS, Places(zero=0.0))
-    assert np.abs(found.turn[:, 0]).max() < 1e-4 < np.abs(identify(Device(5).tour(), PAPERS).turn[:, 0]).max()
+    assert np.abs(found.turn[:, 0]).max() < 1e-4 < np.abs(identify(Device(5).tour(), PAPERS).turn[1, 0])
 
 
 def test_the_next_pose_shows_more_than_a_repeated_or_a_random_one():
@@ -239,24 +239,39 @@ def test_the_next_pose_shows_more_than_a_repeated_or_a_random_one():
     assert chosen < min(drawn)
 
 
-def test_a_pose_with_a_slip_or_a_hand_is_named_and_widens_the_errors():
+SLIPS = {
+    "one pose": {2: (0, 0, 0.3, 0)},
+    "two poses": {2: (0, 0, 0.3, 0), 5: (0, -0.5, 0, 0)},
+    "weighed": {9: (0, 0, 0, 0.2)},
+}
+
+
+@pytest.mark.parametrize("slips", quick([SLIPS["two poses"]], SLIPS.values()), ids=SLIPS)
+def test_a_pose_with_a_slip_or_a_hand_is_left_out_and_named(slips):
     device = Device(6)
     observations = device.tour(bare=10)
-    good = moments_from(ARM, observations).identified
-    observations[2] = observations[2]._replace(effort=np.add(observations[2].effort, (0.0, 0.0, 0.3, 0.0)))
-    result = moments_from(ARM, observations)
-    assert f"Nm, pose 3, {ARM.joint_names[2]}" in result.lines[4]
-    found = result.identified
+    for index, error in slips.items():
+        observations[index] = observations[index]._replace(effort=np.add(observations[index].effort, error))
+    found = identify(observations, PAPERS)
+    assert {index for index, _ in found.rejected} == set(slips)
+    for index, reason in found.rejected:
+        assert f"joint {int(np.argmax(np.abs(slips[index]))) + 1}" in reason
     assert np.all(np.abs(found.moments - device.moments) < 4.0 * found.error)
-    assert found.torque_error[2] > 2.0 * good.torque_error[2]
 
 
-def test_poses_that_do_not_fit_one_arm_are_refused_together():
-    observations = Device(7).tour(bare=8)
-    for k in range(6):
+@pytest.mark.parametrize(
+    ("bare", "spoilt", "words"),
+    [
+        pytest.param(30, 12, r"pose 17: effort of joint 1 is", marks=pytest.mark.thorough),
+        (8, 6, "off in half of the poses"),
+    ],
+)
+def test_poses_that_do_not_fit_one_arm_are_refused_together(bare, spoilt, words):
+    observations = Device(7).tour(bare=bare)
+    for k in range(spoilt):
         error = np.eye(4)[k % 4] * (-1) ** k  # Nm
         observations[2 * k] = observations[2 * k]._replace(effort=observations[2 * k].effort + error)
-    with pytest.raises(DataError, match=r"the poses do not fit one arm: .*off in half of the poses.*touched"):
+    with pytest.raises(DataError, match=rf"the poses do not fit one arm: .*{words}.*touched"):
         identify(observations, PAPERS)
 
 
