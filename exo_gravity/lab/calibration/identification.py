@@ -43,6 +43,7 @@ from exo_gravity.lab.calibration.moment_model import TURNS, MomentModel
 from exo_gravity.lab.calibration.pose_fit import (
     DISTURBED,
     FIT,
+    FitLayout,
     Places,
     asked_for,
     bounded,
@@ -160,9 +161,8 @@ def identify(observations: Sequence[Observation], model: MomentModel, places: Pl
     error = np.where(hidden, np.inf, np.sqrt(np.diag(covariance)))
     moments, scale = unknowns[at.moment], np.exp(unknowns[at.scale])
     check_physical(moments, error[at.moment], scale, direction, model)
-    _check_turns(np.degrees(unknowns[at.turn]).reshape(-1, TURNS))
+    _check_joints(unknowns, at)
     stiffness, slope = unknowns[at.spring], unknowns[at.slope]
-    _check_extras(stiffness, slope)
     slack = -unknowns[at.offset] * scale / np.where(stiffness > 0.0, stiffness, np.inf)
     residual = rows.effort - rows.predicted(solution.unknowns)
     beyond_noise = np.maximum(used.sigma**2 - rows.only(keep).sigma ** 2, 0.0)
@@ -204,26 +204,18 @@ def _names(model: MomentModel) -> tuple[str, ...]:
     return (*model.names, *(f"{what} {n}" for what in ("torque scale", "offset") for n in joints))
 
 
-def _check_turns(turns: np.ndarray) -> None:
-    """Raise DataError unless the joints of an arm can be turned by `turns` (n, 3) degrees."""
-    for joint, (zero, *across) in enumerate(turns.tolist(), start=1):
-        for what, off, advice in (
-            ("zero", zero, "set it by a jig or a stop, or check the URDF"),
-            ("axis", math.hypot(*across), "check the URDF"),
-        ):
-            if abs(off) > ACCEPTED.turn:
-                most = f"must be within {ACCEPTED.turn:g}"
-                raise DataError(f"joint {joint}: its {what} is {off:+.1f} degrees off: {most}: {advice}")
-
-
-def _check_extras(stiffness: np.ndarray, slope: np.ndarray) -> None:
-    """Raise DataError unless a device can have springs of `stiffness` (n,) Nm/rad and these slopes (n,) in 1/K."""
-    for joint in np.flatnonzero(stiffness > MAX_STIFFNESS):
-        most = f"must be at most {MAX_STIFFNESS:g}: does a spring carry the arm, or does the joint touch a stop?"
-        raise DataError(f"joint {joint + 1}: a spring of {stiffness[joint]:.2f} Nm/rad: {most}")
-    for joint in np.flatnonzero(np.abs(slope) > ACCEPTED.slope):
-        most = f"must be within {ACCEPTED.slope:g}: was the arm changed between the tours?"
-        raise DataError(f"joint {joint + 1}: torque scale changes by {slope[joint]:+.4f} per K: {most}")
+def _check_joints(unknowns: np.ndarray, at: FitLayout) -> None:
+    """Raise DataError unless a device can have the zeros, axes, springs and slopes of these unknowns (count,)."""
+    zero, *across = np.degrees(unknowns[at.turn]).reshape(-1, TURNS).T
+    stiff, changed = "does a spring carry the arm, or does it touch a stop?", "was the arm changed between the tours?"
+    for what, found, most, advice in (
+        ("its zero is {:+.1f} degrees off", zero, ACCEPTED.turn, "set it by a jig or a stop, or check the URDF"),
+        ("its axis is {:+.1f} degrees off", np.hypot(*across), ACCEPTED.turn, "check the URDF"),
+        ("a spring of {:.2f} Nm/rad", unknowns[at.spring], MAX_STIFFNESS, stiff),
+        ("torque scale changes by {:+.4f} per K", unknowns[at.slope], ACCEPTED.slope, changed),
+    ):
+        for joint in np.flatnonzero(np.abs(found) > most):
+            raise DataError(f"joint {joint + 1}: {what.format(found[joint])}: must be within {most:g}: {advice}")
 
 
 def check_physical(
