@@ -7,6 +7,7 @@ with each other.
 """
 
 import math
+import warnings
 from collections.abc import Callable
 from typing import Any
 
@@ -43,7 +44,9 @@ def gravload(arm: ArmModel) -> Reference:
 
 def toolbox_robot(arm: ArmModel) -> Any:
     """Return the arm as the Robotics Toolbox's DHRobot."""
-    from roboticstoolbox import DHRobot, RevoluteDH
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", SyntaxWarning)  # of its sources, which the first import compiles
+        from roboticstoolbox import DHRobot, RevoluteDH
 
     return DHRobot(
         [

@@ -141,13 +141,10 @@ def _frames(bag: Bag, rate: int) -> tuple[dict[str, list[str]], dict[str, np.nda
 
 def _statistics(values: np.ndarray) -> dict[str, list[float]]:
     """Return what LeRobot normalises numbers (frames, k) by."""
-    found = {
-        "min": values.min(axis=0),
-        "max": values.max(axis=0),
-        "mean": values.mean(axis=0),
-        "std": values.std(axis=0),
+    return {
+        "count": [len(values)],
+        **{name: getattr(values, name)(axis=0).tolist() for name in ("min", "max", "mean", "std")},
     }
-    return {**{key: column.tolist() for key, column in found.items()}, "count": [len(values)]}
 
 
 def _combined(columns: Mapping[str, Sequence[Any]], of: str) -> dict[str, list[float]]:

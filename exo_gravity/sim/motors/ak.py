@@ -416,9 +416,8 @@ class SimulatedMotor:
 
     @property
     def _error_byte(self) -> int:
-        if not self.firmware.error_is_mask:
-            return self.error
-        return self.error | WARM * (self.temperature > WARM_ABOVE) | SHUT_OFF * self._is_shut_off
+        warm = WARM * (self.firmware.error_is_mask and self.temperature > WARM_ABOVE)
+        return self.error | warm | SHUT_OFF * self._is_shut_off
 
 
 def own_ids(joint: JointMotor, firmware: Firmware) -> dict[int, int]:
