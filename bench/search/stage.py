@@ -119,7 +119,8 @@ def _play(stage: Stage, case: Case) -> float:
         stage.run_until(lambda: stage.state is State.ACTIVE, START)
         stage.raise_to(case.pose, MOVE, SETTLE)
     begin = stage.now
-    stage.schedule(case.events, ACTS)
+    for time, name, values in case.events:
+        stage.clock.later(time, partial(ACTS[name], stage, **values))
     if case.begin != CARRIED:
         stage.run(0.05)
         stage.between_cycles(stage.safety.enable)

@@ -5,7 +5,7 @@ Tests and studies play it: `ACTS` has what can happen, and `judge` says what the
 """
 
 import math
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
 from typing import Any, NamedTuple
@@ -141,11 +141,6 @@ class Rig(VirtualArm):
     def send(self, frame: Frame) -> None:
         """Send a frame on the bus, as a foreign host does."""
         self.wire.carry(None, message_of(frame, any(self.device.is_fd)))
-
-    def schedule(self, events: Iterable[tuple[float, str, Mapping[str, Any]]], acts: Mapping[str, Act]) -> None:
-        """Let events happen: each is a time in s from now on, a name in `acts`, and its values."""
-        for time, name, values in events:
-            self.clock.later(time, partial(acts[name], self, **values))
 
     def forget(self) -> None:
         """Forget how the arm has moved so far."""

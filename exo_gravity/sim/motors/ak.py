@@ -416,8 +416,8 @@ class SimulatedMotor:
 
     @property
     def _error_byte(self) -> int:
-        warm = WARM * (self.firmware.error_is_mask and self.temperature > WARM_ABOVE)
-        return self.error | warm | SHUT_OFF * self._is_shut_off
+        is_masked = self.firmware.error_is_mask  # else it is a code, and the motor has not shut off by itself
+        return self.error | WARM * (is_masked and self.temperature > WARM_ABOVE) | SHUT_OFF * self._is_shut_off
 
 
 def own_ids(joint: JointMotor, firmware: Firmware) -> dict[int, int]:
