@@ -107,8 +107,7 @@ def play(seed: int, arm: str) -> Played:
     bound = bound_of(case, stage.direct.was_clamped)
     config = stage.device.arm.config
     stops = config.position_min, config.position_max
-    specs = [motor.joint.spec for motor in stage.motors]
-    done = driven(stage.truth.records, specs, stops, bound.slow, bound.turning)
+    done = driven(stage.truth.records, [motor.joint.spec for motor in stage.motors], stops, bound.slow, bound.turning)
     return Played(case, done, bound, tuple(stage.changes), begin, error)
 
 
