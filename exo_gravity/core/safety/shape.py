@@ -45,7 +45,7 @@ from dataclasses import dataclass
 
 from exo_gravity.core.errors import ParameterError
 from exo_gravity.core.motors.joint_motor import JointSample
-from exo_gravity.core.numbers import clamp, rate_limited
+from exo_gravity.core.numbers import rate_limited
 from exo_gravity.core.safety.guidance import guide_damping
 from exo_gravity.core.safety.limits import DAMPING, DAMPING_RATE, HEAT, MAX_EFFORT_RATE, WALL, Limits
 
@@ -143,7 +143,7 @@ class JointShaper:
         colder = HEAT.span if sample.temperature is None else HEAT.most - sample.temperature
         permitted = limit * (0.5 + 0.5 * max(0.0, min(1.0, colder / HEAT.span)))
         wanted = share * (effort + spring)
-        clamped = clamp(wanted, permitted)
+        clamped = max(-permitted, min(permitted, wanted))
         given = rate_limited(clamped, before, MAX_EFFORT_RATE * dt)
         # The compensator may have clamped it already: all that is permitted counts as clamped.
         missing = given if abs(given) >= permitted else wanted - given
@@ -201,7 +201,7 @@ class JointShaper:
         depth = above if above > 0.0 else -max(0.0, below)  # rad in a wall, > 0 in the upper one
         # Once the joint leaves the wall, no spring pushes it.
         is_left = math.copysign(sample.velocity, sample.velocity * depth) < -WALL.release
-        spring = 0.0 if is_left or not depth else -clamp(WALL.stiffness * depth, WALL.most)
+        spring = 0.0 if is_left or not depth else -max(-WALL.most, min(WALL.most, WALL.stiffness * depth))
         return spring, DAMPING * min(1.0, abs(depth) / WALL.edge)
 
     def bound(

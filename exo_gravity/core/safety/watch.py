@@ -49,7 +49,6 @@ from dataclasses import dataclass
 from enum import Enum
 
 from exo_gravity.core.motors.joint_motor import UNKNOWN, JointMotor, JointSample
-from exo_gravity.core.numbers import clamp
 from exo_gravity.core.safety.command import Fault, FaultCode, Send
 from exo_gravity.core.safety.limits import HEAT, READING, Limits
 
@@ -385,7 +384,7 @@ class JointWatch:
         """
         sample, asked = self.sample, self._expected_torques
         torque = expected_torque(effort, damping, sample.velocity)
-        asked.append((clamp(torque, self._peak), time))
+        asked.append((max(-self._peak, min(self._peak, torque)), time))
         if not sample.time > self._judged:
             return ""
         while asked[0][1] < self._replied - DELIVERY.span:
