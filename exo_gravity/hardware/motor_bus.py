@@ -95,7 +95,7 @@ class MotorBus:
         self._ports = tuple(ports)
         self._buses = list(dict.fromkeys(port for port in ports if port))
         self._failed: dict[CanPort, BusError] = {}  # in this cycle
-        self.motors = tuple(motors)
+        self.motors = tuple(motors)  #: (n,)
         self._joints = frozenset(joint for joint, port in enumerate(self._ports) if port)  # on these buses
         # The ID of each motor's replies by its own ID, on each bus, for each wire format.
         self._ids: dict[tuple[CanPort | None, WireFormat], dict[int, int]] = {}

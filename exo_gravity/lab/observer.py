@@ -586,7 +586,7 @@ class WearerWatch:
     def update(
         self, now: float, joints: Sequence[Sequence[float]] | None, trunk: tuple[Tilt, Floats3, Tilt] | None
     ) -> WearerEstimate | None:
-        """Take a sample of `now` s; return the estimate, None if there is none.
+        """Process the sample taken at `now` s; return the estimate, or None if there is none.
 
         joints: angles rad, velocities rad/s and the motors' efforts Nm, (n,) each; None if one is missing.
         trunk: tilt of what it feels as gravity, its angular velocity (3,) rad/s in the arm's base frame, and tilt of

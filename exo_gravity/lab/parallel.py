@@ -38,7 +38,7 @@ def in_processes(
 ) -> Iterator[Outcome[Item, Result]]:
     """Yield the outcome of each item, worked on in `workers` processes (default: one for each core).
 
-    Each thread has a process of its own, and a new one after a death: so the item that ended it is known.
+    Each thread owns one process, and replaces it when it dies: this identifies the item that ended it.
     """
     idle = SimpleQueue[ProcessPoolExecutor]()
 

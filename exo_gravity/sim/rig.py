@@ -327,7 +327,7 @@ def trunk(action: str) -> Act:
 
 
 def payload_taken(rig: Rig, mass: float, told: float) -> None:
-    """Let the wearer pick up `mass` kg; the operator sets the payload to `told` times that mass."""
+    """Let the wearer pick up `mass` kg; the operator enters `told` times that mass as the payload."""
     rig.catch_up()
     rig.device.arm.carry(mass)
     rig.change(payload=Payload(told * mass))

@@ -38,7 +38,7 @@ _CRC_POLYNOMIAL = 0x4599
 class CanController:
     """One CAN controller. pending: senders, frames and their bits, first in, first out."""
 
-    retransmits: bool  #: It sends a frame again after an error, as all do unless they are told not to.
+    retransmits: bool  #: whether it retransmits a frame after an error, which is the default of CAN controllers
     pending: deque[tuple[object, can.Message, list[int]]] = field(default_factory=deque)
     tec: int = 0  #: Transmit error counter.
     ready: float = -math.inf  #: s from which it may begin.
@@ -60,8 +60,8 @@ class Arbitration:
     - The one that sends the recessive bit (1) and reads a dominant one has a bit error. It sends an error flag that
       ends the frame for both. Both count 8 in their transmit error counter (TEC), and send again as soon as the wire is
       idle: they meet again.
-    - Above 127 a controller is error passive: its flag disturbs nobody, so the other's frame goes through, and after
-      each of its own frames it lets others begin first.
+    - Above a TEC of 127 a controller is error passive: its error flag no longer destroys frames, so the other's gets
+      through. After each frame of its own it lets others start first.
     - Above 255 it is off the bus. What it had to send is lost, and so is what it is given until it is restarted.
 
     A frame that goes through takes 1 off. Lost acknowledgements and receive error counters are not played.

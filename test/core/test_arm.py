@@ -200,7 +200,7 @@ ON_LINKS = np.zeros((4, 2))  # m
 
 
 def with_moments_across(arm: ArmModel, beside: np.ndarray) -> ArmModel:
-    """Return the arm with each centre of gravity offset from its link by `beside`, (4, 2) m, as in `with_rods`."""
+    """Return the arm with each centre of gravity moved off its link axis by `beside`, (4, 2) m, as in `with_rods`."""
     (m1, m2, m3, m4), ((w1, _), (z2, w2), (y3, z3), (y4, z4)) = arm.mass.tolist(), beside.tolist()
     across = (m1 * w1 + m2 * w2, -m2 * z2 + m3 * z3 + m4 * z4, m3 * y3, m4 * y4)
     return ArmModel(arm.length, arm.cog, arm.mass, off_axis=across)
@@ -222,7 +222,7 @@ def with_rods(arm: ArmModel, beside: np.ndarray = ON_LINKS) -> tuple[Any, Any, A
     return pin, model, model.createData()
 
 
-@pytest.mark.parametrize("beside", [0.0, 0.05])  # m, largest offset of a centre of gravity from its link
+@pytest.mark.parametrize("beside", [0.0, 0.05])  # m, largest offset of a centre of gravity from its link axis
 def test_torque_mass_matrix_and_momentum_agree_with_pinocchio_for_random_arms_and_motions(beside):
     rng = np.random.default_rng(7)
     for _ in range(8):

@@ -60,7 +60,7 @@ class StaleLimits:
 
     longest_age: float = 0.18  #: of efforts; less than the gap after which the compensator ramps in from zero
     longest: float = 0.13  #: at a time
-    recovery: float = 0.1  #: of that time that each s with sound efforts makes good
+    recovery: float = 0.1  #: s of it that each s with sound efforts restores
 
 
 MOTION, STALE = MotionLimits(), StaleLimits()
@@ -177,14 +177,14 @@ class StaleEfforts:
 
     A compensator that is late on a busy computer, or whose tilt is late, needs no descent. While efforts are older than
     `timeout` (s), or computed from a late tilt, the motors apply the newest ones, and their damping rises as in a
-    descent; once the efforts are sound again it falls. It ends in a fault once they are stale for too long, too
-    old, or have been so too often: ordinary computers are late for less than `STALE.recovery` of the time. Up to
-    `STALE.longest_age` an arm that moves on at 1 rad/s makes the torque wrong by 18 % of gravity's largest.
+    descent; once the efforts are sound again it falls. Efforts that are stale for too long, too old, or stale too often
+    are a fault: ordinary computers are late for less than `STALE.recovery` of the time. Up to `STALE.longest_age` an
+    arm that moves on at 1 rad/s makes the torque wrong by 18 % of gravity's largest.
 
     are_used: whether the efforts are stale and still used.
-    count: how often that began.
-    why: of the last time.
-    seen: s, when they were last so.
+    count: how often they became stale.
+    why: what was stale last.
+    seen: s, when they were last stale.
     """
 
     def __init__(self, timeout: float) -> None:

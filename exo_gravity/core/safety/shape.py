@@ -61,7 +61,7 @@ class BarrierTuning:
     #: s, time constant with which the brake falls. It rises at once; if it fell so, a light arm would be thrown and
     #: caught by turns, one cycle each
     hold: float = 0.05
-    felt: float = 0.05  #: Nm s/rad; the cause of less is not told
+    felt: float = 0.05  #: Nm s/rad; less damping has no cause to report
     calm: float = 0.25  #: rad/s, `driven_speed` while a motor is late: that of a guided motion
     still: float = 0.75  #: rad/s, from which on a motor then drives no joint; 1.25 lets seven joints reach 0.78 (0.58)
 

@@ -95,7 +95,7 @@ class _Reader:
     a string and a truth value, `1:30` a number and a string. The rules here are those of rcl_yaml_param_parser (Jazzy),
     which takes C's `strtol` with base 0, then `strtod`. test/nodes/test_parameter_file.py compares both on a real node.
 
-    What rcl reads in a way that nobody means is refused, with its line: a key that is given twice (rcl merges), anchors
+    What rcl reads otherwise than its author means is refused, with its line: a key given twice (rcl merges), anchors
     and aliases (rcl ends at an alias), wildcards in a node's name (rcl applies them, no tool does), names that no node
     can have, whole numbers that a leading 0 makes octal (`010` is 8), values and lists that are empty, lists in lists.
     An empty mapping, at which rcl ends, is no parameter: the launcher hands nodes a copy without it.

@@ -363,10 +363,12 @@ class BridgeReport:
             "refused message text": refusal,
         }
         for name, joint, warmed, (power, rms, share) in zip(self._names, samples, self._warmed, loads, strict=True):
-            warmth = joint.temperature
+            temperature = joint.temperature
             values |= {
-                f"{name} temperature (degC)": UNKNOWN if warmth is None else warmth,
-                f"{name} torque by temperature (%)": UNKNOWN if warmth is None else row([100.0 * warmed(warmth)], 1),
+                f"{name} temperature (degC)": UNKNOWN if temperature is None else temperature,
+                f"{name} torque by temperature (%)": (
+                    UNKNOWN if temperature is None else row([100.0 * warmed(temperature)], 1)
+                ),
                 f"{name} torque (Nm)": row([joint.effort], 2),
                 f"{name} power (W)": row([power], 1),
                 f"{name} RMS torque (Nm)": row([rms], 2),
