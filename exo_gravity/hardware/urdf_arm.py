@@ -77,11 +77,15 @@ def arm_from(values: Mapping[str, Any], text: str) -> UrdfArm:
     return arm.corrected(moments).turned(turn)
 
 
-def arm_in_file(values: Mapping[str, Any], why: str) -> UrdfArm:
-    """Return the same arm from the file `urdf.file`. Raises ParameterError, also if it comes from a topic.
+def arm_in_file(values: Mapping[str, Any], why: str) -> UrdfArm | None:
+    """Return the same arm from the file `urdf.file`; None for the paper's arm, which has no such parameter.
 
     why: ends the sentence that it must be a file.
+
+    Raises ParameterError, also if the URDF comes from a topic.
     """
+    if "urdf.file" not in values:
+        return None
     if not values["urdf.file"]:
         raise ParameterError("urdf.file", "", f"a file{why}")
     return arm_from(values, read_urdf(values["urdf.file"]))

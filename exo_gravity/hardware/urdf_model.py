@@ -246,37 +246,13 @@ class UrdfShape:
     @cached_property
     def turns(self) -> np.ndarray:
         """Of each joint's frame its axis and two unit vectors across it, (n, 3, 3), one a row."""
-        return np.array([np.vstack((axis, self._across(n))) for n, axis in enumerate(self._axes)])
+        return np.array([np.vstack((axis, np.linalg.svd(axis[None])[2][1:])) for axis in self._axes])
 
     @property
     def moved_by(self) -> np.ndarray:
         """Whether a joint moves the link of another, (n, n): the first index is that joint's."""
         before = [list(self._bare.supports[joint]) for joint in self._joints]
         return np.array([[joint in moving for moving in before] for joint in self._joints])
-
-    def _across(self, n: int) -> np.ndarray:
-        """Return two unit vectors (2, 3) across the axis of joint n, in its frame."""
-        return np.asarray(np.linalg.svd(self._axes[n][None])[2][1:])
-
-    def pose(self, theta: Sequence[float]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Return where the arm is at `theta` (n,) rad, in the root link's axes.
-
-        The origins (n + 1, 3) in m of the joints and the hand, the axes (n, 3) about which the joints turn, and unit
-        vectors (n, 3) across them, as far as possible along the links.
-        """
-        frames = self.frames(np.array([theta]))
-        turns, along = frames.after[0], self._along_links
-        return frames.places[0], *(np.einsum("nab,nb->na", turns, ways) for ways in (self._axes, along))
-
-    @cached_property
-    def _along_links(self) -> np.ndarray:
-        """Unit vectors (n, 3) across the joints' axes in their own frames, as far as possible along the links."""
-        along = []
-        for n, (axis, way) in enumerate(zip(self._axes, self._along, strict=True)):
-            across = way - axis * (axis @ way)
-            size = float(np.linalg.norm(across))
-            along.append(across / size if size > LEAST_LENGTH else self._across(n)[0])
-        return np.array(along)
 
     def bodies(self) -> tuple[np.ndarray, np.ndarray]:
         """Return mass (n,) kg of each joint's link, and where its centre of gravity is from the joint, (n, 3) m.

@@ -15,6 +15,7 @@ a second, smaller arc, which spans `SIZES.torque_span` at the joint's torque lim
 import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from typing import Any, NamedTuple
 from xml.etree import ElementTree
 from xml.etree.ElementTree import Element
@@ -22,14 +23,13 @@ from xml.etree.ElementTree import Element
 import numpy as np
 
 from exo_gravity.core.arm.paper import ArmModel
-from exo_gravity.core.compensation.laws import URDF_LAW
 from exo_gravity.core.compensation.settings import robot_of
 from exo_gravity.core.errors import ParameterError
 from exo_gravity.core.numbers import JOINT_COUNT, Vector
 from exo_gravity.core.params import Param
 from exo_gravity.core.safety.command import CARRYING, State
 from exo_gravity.core.safety.limits import WALL, Limits, limits_of
-from exo_gravity.hardware.urdf_arm import arm_in_file
+from exo_gravity.hardware.urdf_arm import UrdfArm, arm_in_file
 
 Point = tuple[float, ...]  # (3,)
 
@@ -111,6 +111,15 @@ class OnTrunk:
         return np.stack((y, self.outward * x, -z), axis=1)
 
 
+def _urdf_pose(arm: UrdfArm, theta: Sequence[float]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return where an arm from a URDF is at `theta` (n,) rad, as `Described.pose`."""
+    frames, axes = arm.frames(np.array([theta])), arm.turns[:, 0]
+    along = arm.directions - axes * np.einsum("na,na->n", axes, arm.directions)[:, None]
+    size = np.linalg.norm(along, axis=1)[:, None]
+    across = np.divide(along, size, out=arm.turns[:, 1].copy(), where=size > 1e-3)  # else along its axis
+    return frames.places[0], *(np.einsum("nab,nb->na", frames.after[0], ways) for ways in (axes, across))
+
+
 @dataclass(frozen=True, eq=False)
 class Described:
     """What a description, and a picture, states about one arm of n joints."""
@@ -142,10 +151,10 @@ class Described:
 def described(compensator: Mapping[str, Any], can_bridge: Mapping[str, Any]) -> Described:
     """Return the arm that the parameters of its two nodes describe, or raise ParameterError."""
     limits, friction = limits_of(can_bridge), (compensator["friction.viscous"], compensator["friction.coulomb"])
-    if compensator["law"] == URDF_LAW:
-        arm = arm_in_file(compensator, ", for a picture: the URDF on a topic is one already")
-        at = arm.pose([0.0] * len(arm.names))[0][0]
-        return Described("left" if at[1] > 0.0 else "right", arm.pose, arm.bodies, limits, *friction)
+    if arm := arm_in_file(compensator, ", for a picture: the URDF on a topic is one already"):
+        pose = partial(_urdf_pose, arm)
+        shoulder = pose([0.0] * len(arm.names))[0][0]
+        return Described("left" if shoulder[1] > 0.0 else "right", pose, arm.bodies, limits, *friction)
     side, mass, shoulder = (compensator[name] for name in ("side", "robot.mass", "shoulder_from_imu"))
     on_trunk = OnTrunk(side, robot_of(compensator), mass, shoulder)
     return Described(side, on_trunk.pose, on_trunk.bodies, limits, *friction)

@@ -27,7 +27,6 @@ from std_msgs.msg import String
 from exo_gravity.core.arm.interface import STANDARD_GRAVITY
 from exo_gravity.core.arm.rotation import ZERO, Floats3
 from exo_gravity.core.arm.tilt import Tilt, turning_in_base
-from exo_gravity.core.compensation.laws import URDF_LAW
 from exo_gravity.core.compensation.settings import Settings, settings_of
 from exo_gravity.core.compensation.support import NAME, TOPIC
 from exo_gravity.core.errors import ParameterError
@@ -60,8 +59,8 @@ BRIDGE_PARAMETERS = {
 class BudgetWatch:
     """The torque budget of what an arm carries at present: whether its motors can hold it in every pose.
 
-    It takes about 0.2 s of arithmetic on the executor's thread; the estimate has its own. Motors and joint limits are
-    parameters of `can_bridge`, which are read once.
+    It takes about 0.2 s of arithmetic on the executor's thread, and 1.2 s for seven joints; the estimate has its own.
+    Motors and joint limits are parameters of `can_bridge`, which are read once.
     """
 
     def __init__(self, node: Node) -> None:
@@ -75,9 +74,6 @@ class BudgetWatch:
 
     def update(self, names: Sequence[str], s: Settings) -> None:
         """Check the compensator's settings if they are new; names: of the joints (n,)."""
-        if s.law == URDF_LAW:
-            self.result = Reason(Budget.UNKNOWN, "unknown: it is watched for the paper's arm alone")
-            return
         self._bridge.update()
         support = (1.0 if s.support_adapts else s.support) if s.mode == "zero_g" else 0.0
         arms, springs = (s.loaded, s.worn(s.loaded)), (s.joint_spring, s.tissue)
@@ -235,7 +231,7 @@ class WearerNode(Node):
 
         Raises ParameterError.
         """
-        if values["law"] != URDF_LAW:
+        if "urdf.file" not in values:
             return settings_of({**values, "law": "exact"})  # by which the wearer's torque is estimated in any case
         if self._urdf is None:
             text = read_urdf(values["urdf.file"]) if values["urdf.file"] else self._description

@@ -38,12 +38,13 @@ from exo_gravity.core.safety import guidance as guided
 from exo_gravity.hardware.network import restrict_to_localhost
 from exo_gravity.hardware.urdf_arm import UrdfArm
 from exo_gravity.lab.inputs.arms import read_arm
+from exo_gravity.lab.vocabulary import Budget
 from exo_gravity.nodes.compensator import arm
 from exo_gravity.nodes.compensator.node import CompensatorNode
 from exo_gravity.nodes.ros.inner import NodeExecutor
 from exo_gravity.nodes.ros.messages import to_nanoseconds
 from exo_gravity.nodes.ros.subscriptions import LATCHED
-from exo_gravity.nodes.wearer import WearerNode
+from exo_gravity.nodes.wearer import BRIDGE_PARAMETERS, BudgetWatch, WearerNode
 
 from ..support import CONFIG, PARTS, ROBOT
 from ..support.chains import random_chain
@@ -591,7 +592,7 @@ def test_a_node_of_another_program_with_the_compensators_name_does_not_end_the_n
     values = [KeyValue(key="answers", value="many")]
     report = DiagnosticArray(status=[DiagnosticStatus(name="compensator", values=values)])
     other.create_timer(0.05, lambda: publisher.publish(report))
-    alone.wait_until(lambda: alone.statuses["wearer"].message == "the compensator has no parameter 'law'")
+    alone.wait_until(lambda: alone.statuses["wearer"].message == "the compensator has no parameter 'link_length'")
     assert alone.wearer.failure is None
 
 
@@ -642,10 +643,17 @@ def test_a_joint_that_is_not_listed_is_at_0_for_compensator_wearer_and_tools(alo
     node = alone.add(rclpy.create_node("compensator", **has), is_spun=False)
     _, values, read, made = arm.declared(node)
     assert made.fixed == (names[1],)
-    of_tools = read_arm({"/right/can_bridge": bridge, "/right/compensator": given}, "/right").settings
-    all_of_them = read(values), alone.wearer._read(values), of_tools
+    of_tools = read_arm({"/right/can_bridge": bridge, "/right/compensator": given}, "/right")
+    all_of_them = read(values), alone.wearer._read(values), of_tools.settings
     expected = UrdfArm(text, listed)
     for theta in np.random.default_rng(0).uniform(-2.0, 2.0, (10, 2)):
         for settings in all_of_them:
             torque, _ = settings.torque(theta.tolist(), Tilt.of("left"))
             assert torque == pytest.approx(expected.torque(theta.tolist(), Tilt.of("left")), abs=1e-10)
+    has["parameter_overrides"] = [
+        Parameter(name, value=of_tools.can_bridge[name]) for name in ("joint_names", *BRIDGE_PARAMETERS)
+    ]
+    alone.add(rclpy.create_node("can_bridge", **has))
+    watch = BudgetWatch(alone.wearer)
+    alone.wait_until(lambda: watch.update(listed, of_tools.settings) or watch.result.word != Budget.UNKNOWN)
+    assert watch.result.word == Budget.WITHIN_RATED

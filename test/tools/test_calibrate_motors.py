@@ -21,9 +21,10 @@ from exo_gravity.hardware.bus_lock import BusLock
 from exo_gravity.lab.calibration import motors
 from exo_gravity.lab.calibration.bus_scan import BusScan, MotorAnswer
 from exo_gravity.lab.calibration.live import Person
-from exo_gravity.lab.calibration.motors import HandMotion, MotorSearch
+from exo_gravity.lab.calibration.motors import HandMotion, MotorSearch, positive_turns
 from exo_gravity.lab.calibration.result import CalibrationResult
 from exo_gravity.lab.inputs.arms import configured_arm
+from exo_gravity.lab.inputs.parameter_file import packaged_config
 from exo_gravity.sim import Firmware, SimulatedArm, SimulatedDevice, SimulatedMotor
 
 from ..support.simulated_device import SPECS
@@ -119,6 +120,28 @@ def arm() -> Arm:
 
 def value(result: CalibrationResult, name: str) -> object:
     return next(change.value for change in result.changes if change.name == name)
+
+
+SEEN = "turn it counter-clockwise, seen from {}".format
+
+
+@pytest.mark.parametrize(
+    ("file", "side", "told"),
+    [
+        ("exo.yaml", "left", [SEEN("below"), "move the hand to the left", *["move the hand to the front"] * 2]),
+        ("exo.yaml", "right", [SEEN("above"), "move the hand to the right", *["move the hand to the front"] * 2]),
+        (
+            "seven_joints.yaml",
+            "right",
+            [
+                *("move the hand to the front", "move the hand to the right", SEEN("above")),
+                *("move the hand to the front", SEEN("above"), "move the hand to the left", "move the hand back"),
+            ],
+        ),
+    ],
+)
+def test_a_person_is_told_which_way_is_positive(file: str, side: str, told: list[str]) -> None:
+    assert list(positive_turns(configured_arm(packaged_config(file), side))) == told
 
 
 @pytest.mark.parametrize("seed", range(4))

@@ -34,7 +34,6 @@ from exo_gravity.lab.view import (
     state_of,
     urdf,
 )  # fmt: skip
-from exo_gravity.sim.urdf import UrdfConfig
 from exo_gravity.tools.urdf import urdf_of
 
 from ..support import CONFIG
@@ -155,22 +154,6 @@ def lines(shapes, group):
     return [shape for shape in shapes if (shape.group, shape.kind) == (group, LINE)]
 
 
-@pytest.mark.parametrize("side", ["left", "right"])
-def test_the_pose_is_that_of_the_description(side):
-    model = pinocchio.buildModelFromXML(urdf([description(side)]))
-    data, rng = model.createData(), np.random.default_rng(1)
-    for theta in rng.uniform(-math.pi, math.pi, (50, 4)):
-        pinocchio.framesForwardKinematics(model, data, theta)
-        origins, axes, _ = description(side).pose(theta)
-        frames = [data.oMf[model.getFrameId(name)] for name in description(side).links]
-        assert origins == pytest.approx(np.array([frame.translation for frame in frames]), abs=1e-12)
-        # The description's own axes, in the frames of the links, which turn about them.
-        local = [(0, 0, -1), (1, 0, 0), (0, -1, 0), (0, -1, 0)]
-        mirrored = [(0, 0, 1), (-1, 0, 0), (0, -1, 0), (0, -1, 0)]
-        turned = [f.rotation @ a for f, a in zip(frames, local if side == "left" else mirrored, strict=False)]
-        assert axes == pytest.approx(np.array(turned), abs=1e-12)
-
-
 def test_the_range_of_each_joint_is_an_arc_on_which_the_link_points_at_its_angle():
     theta = (0.3, 0.8, 0.5, 1.0)
     origins, _, _ = description().pose(theta)
@@ -218,23 +201,25 @@ def test_the_state_is_shown_by_colour_and_words(state, more, shown):
     assert state_of(view(state=state, **more)) == shown
 
 
-def test_the_picture_of_a_seven_joint_arm_has_its_joints_where_mujoco_has_them() -> None:
-    arm = configured_arm(packaged_config("seven_joints.yaml"), "right")
+@pytest.mark.parametrize(
+    ("file", "side", "given"),
+    [("exo.yaml", "left", ()), ("exo.yaml", "right", ()), ("seven_joints.yaml", "right", ["arms/seven_joints.urdf"])],
+)
+def test_the_picture_has_its_joints_where_mujoco_has_those_of_its_description(file: str, side: str, given) -> None:
+    """And where it has those of the given URDF."""
+    arm = configured_arm(packaged_config(file), side)
     picture, random = described(arm.compensator, arm.can_bridge), np.random.default_rng(0)
-    text = packaged_config("arms/seven_joints.urdf").read_text(encoding="utf-8")
-    given, _ = UrdfConfig(text=text, joint_names=arm.joint_names, hand="hand").models()
-    drawn = mujoco.MjModel.from_xml_string(urdf([picture]))
-    assert picture.side == "right" and [drawn.joint(n).name for n in range(drawn.njnt)] == list(arm.joint_names)
-    truth, shown = mujoco.MjData(given), mujoco.MjData(drawn)
-    for _ in range(20):
-        theta = random.uniform(arm.low, arm.high)
-        truth.qpos[:] = shown.qpos[:] = theta
-        mujoco.mj_kinematics(given, truth)
-        mujoco.mj_kinematics(drawn, shown)
+    texts = urdf([picture]), *(packaged_config(name).read_text(encoding="utf-8") for name in given)
+    models = list(map(mujoco.MjModel.from_xml_string, texts))
+    assert picture.side == side and [models[0].joint(n).name for n in range(models[0].njnt)] == list(arm.joint_names)
+    for theta in random.uniform(arm.low, arm.high, (20, len(arm.low))):
         origins, axes, along = picture.pose(theta.tolist())
-        np.testing.assert_allclose(origins[:-1], truth.xanchor, atol=1e-9)
-        np.testing.assert_allclose(axes, truth.xaxis, atol=1e-9)
-        np.testing.assert_allclose(origins[:-1], shown.xanchor, atol=1e-5)
         np.testing.assert_allclose(np.einsum("na,na->n", axes, along), 0.0, atol=1e-9)
-    view = ArmView(picture, theta.tolist(), [0.0] * drawn.njnt, [1.0] * drawn.njnt, "active")
-    assert len([shape for shape in arm_shapes(view) if shape.group == "torques"]) == 2 * drawn.njnt
+        for model in models:
+            data = mujoco.MjData(model)
+            data.qpos[:] = theta
+            mujoco.mj_kinematics(model, data)
+            np.testing.assert_allclose(origins[:-1], data.xanchor, atol=1e-5)
+            np.testing.assert_allclose(axes, data.xaxis, atol=1e-5)
+    view = ArmView(picture, theta.tolist(), [0.0] * len(theta), [1.0] * len(theta), "active")
+    assert len([shape for shape in arm_shapes(view) if shape.group == "torques"]) == 2 * len(theta)

@@ -183,7 +183,7 @@ class Settings:
         loaded = robot.with_payload(*self.payload)
         # Computed in every mode, so that an impossible wearer is refused now and not when the mode becomes zero_g.
         whole = self.worn(loaded, self.support_now)
-        if self.wearer_moments and self.mode == "zero_g" and self.law not in ("exact", URDF_LAW):
+        if self.wearer_moments and self.mode == "zero_g" and self.law not in LAWS.by_moments:
             raise ParameterError("law", self.law, "exact with wearer.first_moment: it needs mass and cog")
         wearer = sum(self.wearer_mass) * (1.0 if self.support_adapts else self.support_now)
         given = loaded.given_mass

@@ -17,7 +17,6 @@ import numpy as np
 from exo_gravity.core.arm.interface import MAX_MASS, Arm
 from exo_gravity.core.arm.paper import MAX_LENGTH, ArmModel
 from exo_gravity.core.arm.tilt import SIDES, Tilt
-from exo_gravity.core.compensation.laws import URDF_LAW
 from exo_gravity.core.compensation.settings import WORN_MOMENTS, robot_of
 from exo_gravity.core.errors import ParameterError
 from exo_gravity.core.motors.families import MOTORS
@@ -325,8 +324,7 @@ def model_of(values: Mapping[str, Any], worn: tuple[Sequence[float], Sequence[fl
 
     Raises ParameterError, also if the URDF comes from a topic.
     """
-    if values["law"] == URDF_LAW:
-        own = arm_in_file(values, ": a calibration does not wait for a topic")
+    if own := arm_in_file(values, ": a calibration does not wait for a topic"):
         described = own.scaled([1.0] * len(own.names), values["gravity"])
         rotors = [MOTORS[name].rotor_inertia for name in values["motor"]]
         return DescribedModel(described.with_wearer(*worn) if worn else described, values["use_imu"], rotors)

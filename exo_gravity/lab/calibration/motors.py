@@ -8,7 +8,7 @@ rotor. Whether `zero` survives is tried by switching the power off and on.
 import argparse
 import math
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from statistics import fmean
@@ -16,7 +16,6 @@ from statistics import fmean
 import numpy as np
 from rich.table import Table
 
-from exo_gravity.core.compensation.laws import URDF_LAW
 from exo_gravity.core.errors import DataError, ParameterError
 from exo_gravity.core.motors.ak import FAMILY, MIT, MIT_V3
 from exo_gravity.core.motors.joint_motor import MAX_CAN_ID, OPTIONS, JointMotor, buses_of
@@ -25,18 +24,15 @@ from exo_gravity.lab.calibration.live import Say
 from exo_gravity.lab.calibration.result import CalibrationResult, Change
 from exo_gravity.lab.inputs.arms import ConfiguredArm
 from exo_gravity.lab.inputs.parameter_file import can_options, load
+from exo_gravity.lab.view import described
 
 Clock = Callable[[], float]
 Wait = Callable[[str, Callable[[], Table]], None]
 """(request, watch): shows the request and calls watch() for the table to show, until the person has done it."""
 
-MOTIONS = (
-    "turn the whole arm about the vertical axis, a raised arm from the side to the front",
-    "lift the arm to the side",
-    "lift the upper arm to the front",
-    "bend the elbow",
-)
-TURN = "turn it in the positive direction of the URDF"  # a joint of another arm
+# Where the trunk's axes x, y and z lead, and from where somebody looks who sees them point at themselves.
+TOWARDS = (("back", "to the front"), ("to the right", "to the left"), ("down", "up"))
+SEEN = (("from behind", "from the front"), ("from the right", "from the left"), ("from below", "from above"))
 UNCHECKED = "not checked after a power-up"
 SERVO_MODE = (
     "A V1 or V2 board in servo mode sends the same frames as a V3 board, and obeys none of our commands: read the "
@@ -54,6 +50,7 @@ class HandMotion:
     other: float = 0.5  #: of that turn, which another motor may turn meanwhile
     back: float = 0.5  #: of that turn, which the same motor may turn the other way
     attempts: int = 3  #: at each joint
+    least_swing: float = 0.5  #: sine of the angle between joint and way to the hand, from which it shows a turn
     silence: float = 0.15  #: s without an answer: some replies in a row may be late on a busy computer
 
 
@@ -95,6 +92,18 @@ def calibrate_motors(options: argparse.Namespace, arm: ConfiguredArm, say: Say) 
     return replace(result, changes=(*result.changes, *changes))
 
 
+def positive_turns(arm: ConfiguredArm) -> Iterator[str]:
+    """Yield what turns each joint of an arm at `home` in its positive direction. Raises ParameterError."""
+    places, axes, _ = described(arm.compensator, arm.can_bridge).pose(arm.limits.home)
+    for axis, way in zip(axes, places[-1] - places[:-1], strict=True):
+        swing = np.cross(axis, way)
+        is_shown = np.linalg.norm(swing) > HAND.least_swing * np.linalg.norm(way)
+        motion = "move the hand", swing, TOWARDS
+        what, vector, words = motion if is_shown else ("turn it counter-clockwise, seen", axis, SEEN)
+        component = int(np.argmax(np.abs(vector)))
+        yield f"{what} {words[component][int(vector[component] > 0.0)]}"
+
+
 class MotorSearch:
     """Leads the person through the joints of one arm. clock: s.
 
@@ -116,9 +125,8 @@ class MotorSearch:
     def result(self, pose: Sequence[float]) -> CalibrationResult:
         """Return the result; pose: (n,) deg in which `zero` is measured. Raises DataError if a motor is not found."""
         self._scan()
-        motions = [TURN] * len(self._arm.motors) if self._arm.compensator["law"] == URDF_LAW else MOTIONS
-        for name, motion in zip(self._arm.joint_names, motions, strict=True):
-            self._watch(f"{name}: {motion}, by 30 degrees or so, and back", partial(self._found_by, name))
+        for name, motion in zip(self._arm.joint_names, positive_turns(self._arm), strict=True):
+            self._watch(f"{name}: from home {motion}, by 30 degrees or so, and back", partial(self._found_by, name))
         where = f"{' '.join(f'{angle:g}' for angle in pose)} deg" if any(pose) else ""
         rest = f"bring the arm to {where}" if where else "let the arm hang"
         self._watch(f"{rest}, hands off, until it is still", self._unrest)

@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 
 from exo_gravity.core.arm.springs import Springs, link_angles
-from exo_gravity.core.compensation.laws import URDF_LAW
+from exo_gravity.core.compensation.laws import LAWS
 from exo_gravity.core.compensation.settings import ModelError, joint_spring_of
 from exo_gravity.core.errors import ParameterError
 from exo_gravity.core.motors.joint_motor import TORQUE_SCALE_BOUNDS, scale_at
@@ -197,11 +197,17 @@ def _changes(arm: ConfiguredArm, model: MomentModel, found: Identified, scale: l
         known = np.isfinite(found.scale_error)
         share = np.where(known, found.scale_error / found.scale, for_joints(ModelError().scale, len(scale), max))
         changes.append(Change(node, "model_error.scale", share.round(4).tolist(), "share of torque_scale"))
-    if arm.compensator["law"] not in ("exact", URDF_LAW):
-        changes.append(Change(node, "law", "exact", "the other laws need masses and centres of gravity"))
+    changes += exact_law(arm)
     if any(gain != 1.0 for gain in arm.compensator["gain"]):
         changes.append(Change(node, "gain", [1.0] * len(scale), "now part of the moments and of torque_scale"))
     return tuple(changes)
+
+
+def exact_law(arm: ConfiguredArm) -> Iterator[Change]:
+    """Yield the change to the exact law where the file has one that moments alone do not serve."""
+    if arm.compensator["law"] not in LAWS.by_moments:
+        node = f"{arm.namespace}/compensator"
+        yield Change(node, "law", "exact", "the other laws need masses and centres of gravity")
 
 
 def _zero_changes(arm: ConfiguredArm, found: Identified) -> Iterator[Change]:

@@ -11,11 +11,10 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from exo_gravity.core.compensation.laws import URDF_LAW
 from exo_gravity.core.compensation.settings import wearer_of
 from exo_gravity.core.errors import DataError, ParameterError
 from exo_gravity.lab.calibration.result import Change
-from exo_gravity.lab.calibration.tours import model_of, row
+from exo_gravity.lab.calibration.tours import exact_law, model_of, row
 from exo_gravity.lab.calibration.wearer_fit import PRIOR, WearerFit
 from exo_gravity.lab.inputs.arms import ConfiguredArm
 
@@ -128,9 +127,7 @@ class WornArm:
         noted = f"kg m, +-{errors.max():.2g} at most" if self.model.is_described else f"kg m, +-{row(errors)}"
         parts = self.model.worn_in_file(moments).items()
         changes = [Change(node, parameter, (part.round(5) + 0.0).tolist(), noted) for parameter, part in parts]
-        if self._arm.compensator["law"] not in ("exact", URDF_LAW):
-            changes.append(Change(node, "law", "exact", "the other laws need masses and centres of gravity"))
-        return Found(moments, tuple(changes), compared, refusals)
+        return Found(moments, (*changes, *exact_law(self._arm)), compared, refusals)
 
     def allowed(self, moments: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return `largest_moment`, (n,) kg m, and the torque of what lies beside the links, (n,) Nm."""

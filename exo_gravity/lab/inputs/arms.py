@@ -70,9 +70,9 @@ class ConfiguredArm:
     @property
     def paper_arm(self) -> ArmModel:
         """The robot, for what no other arm than the paper's has. Raises ParameterError."""
-        if self.compensator["law"] == URDF_LAW:
+        if "urdf.file" in self.compensator:
             expected = "exact: this is for the paper's arm alone"
-            raise ParameterError(f"{self.namespace}/compensator law", URDF_LAW, expected)
+            raise ParameterError(f"{self.namespace}/compensator law", self.compensator["law"], expected)
         return cast(ArmModel, self.robot)
 
     @cached_property
@@ -89,7 +89,7 @@ def settings_from(values: Mapping[str, Any], why: str = "", read: Callable[[str]
 
     Raises ParameterError, also if a URDF comes from a topic; why: ends the sentence that it must be a file.
     """
-    return settings_of(values, arm_in_file(values, why) if "urdf.file" in values else None, read)
+    return settings_of(values, arm_in_file(values, why), read)
 
 
 def read_arm(nodes: Nodes, namespace: str) -> ConfiguredArm:

@@ -1,7 +1,6 @@
 # Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
 """The parameters of a file, checked as the nodes check them at their start."""
 
-from exo_gravity.core.compensation.laws import URDF_LAW
 from exo_gravity.core.compensation.settings import COMPENSATOR, compensator_table
 from exo_gravity.core.errors import BusError, named
 from exo_gravity.core.motors.joint_motor import buses_of, motors_of, traffic_of
@@ -36,7 +35,7 @@ def check_nodes(nodes: Nodes) -> None:
             ignored = {param.name for param in COMPENSATOR} - {param.name for param in table}  # of the paper's arm
             used = {name: value for name, value in given.items() if name not in ignored}
             values = node_values({node: used}, node, table)
-            if values["law"] != URDF_LAW or values["urdf.file"]:
+            if values.get("urdf.file", True):
                 with named(f"{node} "):
                     settings_from(values)
 

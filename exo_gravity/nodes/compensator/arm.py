@@ -19,7 +19,7 @@ from exo_gravity.core.arm.tilt import SIDES
 from exo_gravity.core.compensation import settings
 from exo_gravity.core.compensation.compensator import Compensation, Compensator
 from exo_gravity.core.compensation.guidance import CommandFade
-from exo_gravity.core.compensation.laws import GROUP, URDF_LAW
+from exo_gravity.core.compensation.laws import GROUP
 from exo_gravity.core.compensation.settings import Settings
 from exo_gravity.core.errors import ParameterError
 from exo_gravity.core.params import Param, installed
@@ -48,7 +48,7 @@ def declared(node: Node) -> tuple[Sequence[Param], dict[str, Any], Read, UrdfArm
     table = settings.compensator_table(given_to(node))
     _forget_unused(node, {param.name for param in table})
     values = declare(node, table)
-    arm = arm_from(values, _description(node, values)) if values["law"] == URDF_LAW else None
+    arm = arm_from(values, _description(node, values)) if "urdf.file" in values else None
     for note in arm.notes if arm else ():
         node.get_logger().warning(note)
     return table, values, lambda values: settings.settings_of(values, arm, read_model), arm
@@ -64,11 +64,11 @@ def check_side(namespace: str, side: str) -> None:
         raise ParameterError("side", side, f"{named}, as the namespace {namespace} says, or the node in another one")
 
 
-def sentence(s: Settings) -> str:
-    """Return what is compensated, for the log."""
+def sentence(s: Settings, side: str) -> str:
+    """Return what is compensated, for the log. side: as in `check_side`."""
     carried = f"compensates {s.mass:.2f} kg, at most {row(s.max_effort)} Nm"
-    side = "" if s.law == URDF_LAW else f"{s.side} arm, "
-    return f"{side}mode {s.mode}, support {s.support:g}, law {s.law}: {carried}"
+    whose = f"{side} arm, " if side else ""
+    return f"{whose}mode {s.mode}, support {s.support:g}, law {s.law}: {carried}"
 
 
 def report(control: Compensator, answer: Compensation, names: Sequence[str]) -> dict[str, object]:
@@ -130,7 +130,7 @@ def _forget_unused(node: Node, used: set[str]) -> None:
     for name in unused:
         node.undeclare_parameter(name)
     if unused:
-        node.get_logger().warning(f"law {URDF_LAW} takes the arm from its URDF and ignores {', '.join(unused)}")
+        node.get_logger().warning(f"law urdf takes the arm from its URDF and ignores {', '.join(unused)}")
 
 
 def _description(node: Node, values: dict[str, Any]) -> str:

@@ -68,7 +68,8 @@ class CompensatorNode(Node):
         super().__init__("compensator", context=context, automatically_declare_parameters_from_overrides=True)
         self._lock = threading.Lock()  # guards the control: joint states arrive on another thread
         table, values, read, self._urdf = declared(self)
-        check_side(self.get_namespace(), values.get("side", ""))
+        self._side = values.get("side", "")
+        check_side(self.get_namespace(), self._side)
         self._names = values["joint_names"]
         settings = read(values)
         self._control = Compensator(settings, self._names)
@@ -96,7 +97,7 @@ class CompensatorNode(Node):
         # Only the executor's thread reports: diagnostics are not for two threads.
         self._changed = self.create_guard_condition(self._report_changes)
         self.create_timer(REPORT_PERIOD, self._report_current)
-        self.get_logger().info(sentence(settings))
+        self.get_logger().info(sentence(settings, self._side))
         for thread in self._threads:
             if not is_called or thread is not self._joint_states:
                 thread.start()
@@ -212,7 +213,7 @@ class CompensatorNode(Node):
     def _apply(self, settings: Settings, _changed: set[str]) -> None:
         with self._lock:
             self._control.apply(settings)
-        self.get_logger().info(sentence(settings))
+        self.get_logger().info(sentence(settings, self._side))
 
     def _begin(self, client: Any, _request: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
         with self._lock:
