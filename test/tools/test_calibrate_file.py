@@ -14,7 +14,6 @@ import json
 import math
 import os
 import re
-import shutil
 import signal
 import threading
 from dataclasses import replace
@@ -68,25 +67,36 @@ def test_the_written_file_takes_limits_torques_and_home_from_urdf_and_motors(tmp
     assert can_options(load(output)["/right/can_bridge"]) == {"fd": True}
 
 
-@pytest.mark.parametrize("motor", [["AK80-64"], ["DM-J4340", "--fd"]], ids=" ".join)
-def test_a_simulated_arm_of_a_new_file_is_carried_wherever_it_is_started(motor, tmp_path, run_tool, monkeypatch):
-    shutil.copy(CONFIG / "arms" / "elbow.urdf", tmp_path)
-    monkeypatch.chdir(tmp_path)
-    arm = ("--urdf", "elbow.urdf", "--motors", *motor, "--ids", 1)
-    assert run_tool("calibrate", "new", *arm, "--simulate", "--output", "arm.yaml").code == 0
-    monkeypatch.chdir("/")
-    script = TrialScript.parse({"name": "raise", "steps": [{"move": [0.8], "over": 3.0}, {"hold": 3.0}]})
-    (trial,) = simulated_trials(tmp_path / "arm.yaml", script)
-    assert trial.run().position.max() > 0.7 and not trial.trouble
-
-
 TABLE = """<robot name="table"><link name="base"/>
 <joint name="lift" type="revolute"><parent link="base"/><child link="arm"/><axis xyz="0 1 0"/>
 <limit lower="{}" upper="{}" effort="9" velocity="5"/></joint>
 <link name="arm"><inertial><origin xyz="{} 0 {}"/><mass value="1.2"/>
 <inertia ixx="0.01" iyy="0.01" izz="0.01" ixy="0" ixz="0" iyz="0"/></inertial></link></robot>"""
+
+
+@pytest.mark.parametrize(
+    ("motor", "urdf", "target"),
+    [
+        (["AK80-64"], TABLE.format("-0.3", "3.0", "0.1819", "0.0832"), 1.2),  # hangs at 2.0
+        (["DM-J4340", "--fd"], (CONFIG / "arms" / "elbow.urdf").read_text(), 0.8),
+    ],
+)
+def test_a_simulated_arm_of_a_new_file_is_carried_wherever_it_is_started(
+    motor, urdf, target, tmp_path, run_tool, monkeypatch
+):
+    (tmp_path / "arm.urdf").write_text(urdf)
+    monkeypatch.chdir(tmp_path)
+    arm = ("--urdf", "arm.urdf", "--motors", *motor, "--ids", 1)
+    assert run_tool("calibrate", "new", *arm, "--simulate", "--output", "arm.yaml").code == 0
+    monkeypatch.chdir("/")
+    script = TrialScript.parse({"name": "raise", "steps": [{"move": [target], "over": 3.0}, {"hold": 3.0}]})
+    (trial,) = simulated_trials(tmp_path / "arm.yaml", script)
+    assert np.ptp(trial.run().position) > 0.7 and not trial.trouble
+
+
 HANG = {  # the joint's limits, where its link's mass lies at 0 in x and z; what is said, and where home is
     "falls from 0": (("-0.3", "3.0", "0.1819", "0.0832"), "the arm hangs at lift 115 degrees", 2.0),
+    "is turned by less than friction": (("-1.0", "2.0", "0.001", "0"), "the arm hangs at lift 0 degrees", 0.0),
     "hangs at 0": (("-1.0", "1.0", "0", "-0.2"), "the arm hangs at lift 0 degrees", 0.0),
     "stands upright at 0": (("-0.5", "1.2", "0", "0.2"), "cannot hang within its limits: lift would rest", 1.2),
 }

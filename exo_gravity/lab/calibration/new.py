@@ -109,7 +109,8 @@ def turning_joints(text: str) -> dict[str, JointRange]:
 def hanging(arm: UrdfArm, low: np.ndarray, high: np.ndarray) -> np.ndarray:
     """Return the angles (n,) in rad in which the upright arm comes to rest within `low` and `high`, (n,) rad.
 
-    Of several such poses the lowest one; a joint that gravity does not turn is as near to 0 as it can be.
+    Of several such poses the lowest one. A joint that gravity turns by LITTLE, less than its friction, is as near to 0
+    as it can be.
     """
     count, down = len(low), Tilt.of("left").direction
     shares = np.linspace(0.01, 0.99, 50)[:, None]  # of the way from 0
@@ -130,7 +131,8 @@ def hanging(arm: UrdfArm, low: np.ndarray, high: np.ndarray) -> np.ndarray:
     for joint in range(count):
         simpler = best.copy()
         simpler[joint] = np.clip(0.0, low[joint], high[joint])
-        if abs(energy(simpler) - energy(best)) < 1e-3 * LITTLE:
+        gained = (energy(simpler) - energy(best)) / max(LITTLE, abs(simpler[joint] - best[joint]))  # Nm
+        if gained < LITTLE and np.all(np.diff(np.abs(torques(np.stack((best, simpler)))), axis=0) < LITTLE):
             best = simpler
     return best
 
@@ -161,8 +163,7 @@ def write_new(new: NewArm, output: Path) -> list[str]:
     ranges = [known[name] for name in names]
     low, high = np.transpose([(edge.low, edge.high) for edge in ranges])
     poses = np.random.default_rng(0).uniform(low, high, (POSES, len(names)))
-    upright = Tilt.of("left")
-    needed = np.max(np.abs(arm.torques(poses, np.tile(upright.direction, (POSES, 1)))), axis=0)
+    needed = np.max(np.abs(arm.torques(poses, np.tile(Tilt.of("left").direction, (POSES, 1)))), axis=0)
     rated = [MOTORS[motor].rated_torque for motor in new.motors]
     efforts = [min(most, own or most) for most, own in zip(rated, arm.max_effort, strict=True)]
     home = hanging(arm, low, high)
@@ -170,7 +171,7 @@ def write_new(new: NewArm, output: Path) -> list[str]:
     for name, effort, most in zip(names, efforts, needed.tolist(), strict=True):
         if most > effort:
             notes.append(f"{name}: gravity takes up to {most:.1f} Nm of it, max_effort is {effort:g} Nm")
-    output.write_text(_file(new, names, ranges, efforts, needed.tolist(), home.tolist()), encoding="utf-8")
+    output.write_text(_file(new, names, ranges, efforts, needed.tolist(), home.round(3).tolist()), encoding="utf-8")
     try:
         read_arm(load(output), f"/{new.side}")
     except ParameterError:
@@ -211,6 +212,7 @@ def _file(
     direction: {_row([1] * count)}
     zero: {_row([0.0] * count)}
     motor_timeout: {_row(timeouts)}
+    home: {_row(home)}  # rad, where it begins
     friction: {{coulomb: {_row([0.1] * count)}, viscous: {_row([0.02] * count)}}}  # Nm, Nm s/rad
 """
     listed = _row(names)
@@ -231,7 +233,7 @@ def _file(
     position_min: {_row([low for low, _ in edges])}  # rad, {INSIDE:g} inside the URDF's where the arm hangs farther off
     position_max: {_row([high for _, high in edges])}
     max_effort: {_row(efforts)}  # Nm; gravity of the arm alone, upright: up to {_row([round(x, 1) for x in needed])}
-    home: {_row([round(angle, 3) for angle in home])}  # rad, where the arm hangs by its URDF
+    home: {_row(home)}  # rad, where the arm hangs by its URDF
 
 /{new.side}/compensator:
   ros__parameters:
