@@ -122,18 +122,18 @@ def hanging(arm: UrdfArm, low: np.ndarray, high: np.ndarray) -> np.ndarray:
         """Return the work of gravity's torque in J on the way from 0."""
         return float(np.mean(torques(shares * pose) @ pose))
 
-    def fall(start: np.ndarray) -> np.ndarray:
-        bounds = list(zip(low, high, strict=True))
-        return np.asarray(minimize(energy, start, jac=lambda pose: torques(pose[None])[0], bounds=bounds).x)
+    def fall(start: np.ndarray, within: np.ndarray) -> np.ndarray:
+        return np.asarray(minimize(energy, start, jac=lambda pose: torques(pose[None])[0], bounds=within).x)
 
+    within = np.stack((low, high), axis=1)
     starts = np.random.default_rng(0).uniform(low, high, (STARTS, count))
-    best = min(map(fall, starts), key=energy)
+    best = min((fall(start, within) for start in starts), key=energy)
     for joint in range(count):
-        simpler = best.copy()
-        simpler[joint] = np.clip(0.0, low[joint], high[joint])
-        gained = (energy(simpler) - energy(best)) / max(LITTLE, abs(simpler[joint] - best[joint]))  # Nm
-        if gained < LITTLE and np.all(np.diff(np.abs(torques(np.stack((best, simpler)))), axis=0) < LITTLE):
-            best = simpler
+        nearer = within.copy()
+        nearer[joint] = np.clip(0.0, low[joint], high[joint])
+        simpler = fall(best, nearer)
+        if energy(simpler) - energy(best) < 0.5 * LITTLE * max(LITTLE, abs(simpler[joint] - best[joint])):
+            best, within = simpler, nearer
     return best
 
 
