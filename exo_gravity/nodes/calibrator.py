@@ -53,7 +53,7 @@ class CalibratorNode(Node):
         self._tour = tour_of(values)
         self._tilt = TiltInput(side_of(values), values["tilt_timeout"])
         self._bridge = f"{self.get_namespace().strip('/')}/can_bridge".lstrip("/")
-        self._bridge_state, self._bridge_message = "", ""
+        self._bridge_state, self._bridge_message = "", "no can_bridge has reported"
         self._began = False
         self._reported: dict[str, Any] = {"progress": "", "trouble": "", "done": False}  # printed last
         self._printed = 0  # observations

@@ -95,7 +95,9 @@ def sent(node, monkeypatch):
         arm = ArmOnBus(("virtual", "arm", {}), MOTORS_OF_ARM, Limits(NAMES), 0.004)
         report = BridgeReport(node, arm, {"can0": Traffic(4)}, Lease(), SimpleNamespace(last=("none", "none")))
         for n in range(count):
-            report.send(loop(n), NO_EFFORTS._replace(answered=clock.now if answered is None else answered), NO_REASON)
+            report.send(
+                loop(n), NO_EFFORTS._replace(answered=clock.now if answered is None else answered), NO_REASON, ""
+            )
             clock.now += 0.1
         return reports
 
@@ -148,7 +150,7 @@ def stale(n):
         ),
         (stale, 15, WARN, "active, still used: efforts 70 ms old", {"rides": "1"}),
         (stale, -1, OK, "active", {}),
-        (lambda _: None, 0, WARN, "", {"state": "inactive", "source": "simulated", "control held by": "nobody"}),
+        (lambda _: None, 0, WARN, "inactive: enable it", {"state": "inactive", "control held by": "nobody"}),
     ],
 )
 def test_what_an_operator_must_know_is_in_the_headline_and_in_a_key(sent, loop, at, level, said, expected):

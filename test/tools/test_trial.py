@@ -271,7 +271,7 @@ def test_a_person_waits_until_every_arm_is_active_whether_or_not_a_limit_acts():
     assert WAITING in text and "effort commands" in text
     assert WAITING in screen.at(11.0, bridge=status("ramping in"))
     assert f"{TAKE_HOLD}: in 5 s, bring the arm to 6 34 69 29 deg" in screen.at(12.0)
-    assert screen.printed == []
+    assert screen.out.getvalue() == "until the arm is carried: checking: waiting for effort commands\n"
     assert TAKE_HOLD in Screen().at(10.0, bridge=status("active", 1, message="active, limited by max_effort"))
     assert WAITING in Screen(bridges=("left/can_bridge", "right/can_bridge")).at(10.0)
 

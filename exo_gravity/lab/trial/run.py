@@ -66,6 +66,7 @@ class TrialScreen:
         self.done = False  #: the last step has ended
         self.status: dict[str, dict[str, Any]] = {}  #: of each node on /diagnostics
         self.faults: list[str] = []  #: warnings and errors of the nodes
+        self._told: list[str] = []  # of them, printed before the arm is carried
         self._arms: dict[str, dict[str, Any]] = {}
         self._index = -1  # of the current step
         self._step_start = self._last_line = self.clock()
@@ -95,6 +96,10 @@ class TrialScreen:
         self.status = content.pop("status", {})
         self.faults = content.pop("faults", [])
         self._arms = {name: arm for name, arm in content.items() if "position" in arm}
+        new = [fault for fault in self.faults if fault not in self._told]
+        for fault in new if self.guided and self._start == math.inf else ():
+            self._told.append(fault)
+            self.console.print(f"until the arm is carried: {fault}", markup=False, soft_wrap=True)
         if not self._ending:
             self._follow([arm["step"]["step"] for arm in content.values() if "step" in arm])
             if self._start < math.inf:
@@ -118,8 +123,7 @@ class TrialScreen:
     @property
     def has_no_bridge(self) -> bool:
         """Whether no bridge reports although all nodes run already. Those that are started may need longer."""
-        is_late = self.clock() - self._first_line > BRIDGE_TIMEOUT
-        return is_late and not self.bridges and not self._states
+        return self.clock() - self._first_line > BRIDGE_TIMEOUT and not self.bridges and not self._states
 
     @property
     def is_let_down(self) -> bool:
@@ -214,8 +218,7 @@ def describe(step: Step, guided: bool) -> str:
         "walk": f"walk {time}", "sit": "sit down hard", "bow": f"bow to {over}", "lean": f"lean to {over}",
         "load": f"take {loaded:g} kg into the hand" if loaded else "let go of the load",
     }  # fmt: skip
-    alone = f"{'' if guided else 'the wearer: '}{trunk.get(step.action)}, and leave the arm alone"
-    return said.get(step.action, alone)
+    return said.get(step.action, f"{'' if guided else 'the wearer: '}{trunk.get(step.action)}, and leave the arm alone")
 
 
 RECORDER = "/recorder"
@@ -270,8 +273,7 @@ class Trial:
             self.folder.mkdir(parents=True)
             path.write_text(text_of(nodes), encoding="utf-8")
         except OSError as error:
-            expected = f"a writable folder ({error.strerror})"
-            raise ParameterError("output", str(self.folder.parent), expected) from None
+            raise ParameterError("output", str(self.folder.parent), f"a writable folder ({error.strerror})") from None
         return path
 
 
@@ -289,8 +291,7 @@ def run_trial(trial: Trial, console: Console, stopped: Stopping, on_progress: Ca
     on_progress: as in `TrialScreen`.
     """
     # On arms that are carried already the clock leads: a simulator's newest step may be that of an earlier trial.
-    unguided = START_TIME if trial.params is None else None
-    lead = LEAD if trial.guided else unguided
+    lead = LEAD if trial.guided else START_TIME if trial.params is None else None
     bridges = [node.lstrip("/") for node in stages(load(trial.params))[0]] if trial.params else []
     screen = TrialScreen(trial.script, trial.guided, console, bridges, lead, on_progress)
     last_errors: dict[str, str] = {}
@@ -315,8 +316,7 @@ def run_trial(trial: Trial, console: Console, stopped: Stopping, on_progress: Ca
         if not nodes.done():
             screen.end("letting the arm down and closing the recording")
         ending.set()
-        dead = nodes.result()
-    if dead:
+    if dead := nodes.result():
         node, code = dead
         trouble = f"{node.lstrip('/')} ended with exit code {code}: {last_errors.get(node, f'see {path}')}"
         return TrialEnd(trouble, 2 if code == 2 else 1)

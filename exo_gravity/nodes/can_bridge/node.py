@@ -85,6 +85,7 @@ def _transition(function: Callable[[Any], None]) -> Callable[..., TransitionCall
 
     @wraps(function)
     def callback(node: "CanBridge", _state: LifecycleState) -> TransitionCallbackReturn:
+        node.error = ""
         try:
             function(node)
             return TransitionCallbackReturn.SUCCESS
@@ -229,7 +230,7 @@ class CanBridge(LifecycleNode):
     def _on_report(self) -> None:
         if self.loop is not None and self._owned is not None:
             self._check_watchdog(self._owned.watchdog, self.loop)
-        self._report.send(self.loop, self._exchange.newest, self._exchange.refusal)
+        self._report.send(self.loop, self._exchange.newest, self._exchange.refusal, self.error)
 
     def _check_watchdog(self, watchdog: Watchdog, loop: ControlLoop) -> None:
         """Let no motor be switched on before the watchdog watches, and none stay on without it or this node."""
@@ -240,7 +241,7 @@ class CanBridge(LifecycleNode):
 
     def _report_descent(self) -> None:
         with contextlib.suppress(Exception):  # whatever the middleware does, the arm comes down
-            self._report.send(self.loop, self._exchange.newest, self._exchange.refusal)
+            self._report.send(self.loop, self._exchange.newest, self._exchange.refusal, self.error)
 
 
 def _declared(node: Node) -> tuple[dict[str, Any], ArmOnBus]:

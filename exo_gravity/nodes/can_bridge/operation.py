@@ -304,12 +304,18 @@ class BridgeReport:
         names = zip(self._names, arm.motors, strict=True)
         self._without_timeout = words(*[name for name, motor in names if not motor.timeout])
 
-    def send(self, loop: ControlLoop | None, newest: Efforts, refusal: Reason) -> None:
-        """Report on `loop`, None while the node is inactive. refusal: why the last message was refused."""
+    def send(self, loop: ControlLoop | None, newest: Efforts, refusal: Reason, error: str) -> None:
+        """Report on `loop`, None while the node is inactive.
+
+        refusal: why the last message was refused. error: why the last transition failed, ''.
+        """
         request, answer = self._services.last
         operator = {HELD_BY: self._lease.holder or NOBODY, "request": request, "answer": answer}
         if loop is None:
-            self._diagnostics.report(WARN, INACTIVE, {"state": INACTIVE, "source": self._source, **operator})
+            why = error or "enable it on the page, or configure and activate it"
+            self._diagnostics.report(
+                WARN, f"{INACTIVE}: {why}", {"state": INACTIVE, "source": self._source, **operator}
+            )
             return
         now, safety = time.monotonic(), loop.safety
         fault, resume = safety.fault, safety.why_not_resumed  # read once: the control thread goes on

@@ -66,9 +66,8 @@ def check_side(namespace: str, side: str) -> None:
 
 def sentence(s: Settings, side: str) -> str:
     """Return what is compensated, for the log. side: as in `check_side`."""
-    carried = f"compensates {s.mass:.2f} kg, at most {row(s.max_effort)} Nm"
-    whose = f"{side} arm, " if side else ""
-    return f"{whose}mode {s.mode}, support {s.support:g}, law {s.law}: {carried}"
+    how = f"mode {s.mode}, support {s.support:g}, law {s.law}"
+    return f"{f'{side} arm, ' if side else ''}{how}: compensates {s.mass:.2f} kg, at most {row(s.max_effort)} Nm"
 
 
 def report(control: Compensator, answer: Compensation, names: Sequence[str]) -> dict[str, object]:
@@ -112,8 +111,7 @@ def warnings_of(control: Compensator, answer: Compensation, names: Sequence[str]
     if answer.held:
         warnings[CompensatorWarning.LATE_TILT] = answer.held
     if answer.fallback:
-        replaces = f"the exact law replaces {control.settings.law}: {answer.fallback}"
-        warnings[CompensatorWarning.EXACT_LAW] = replaces
+        warnings[CompensatorWarning.EXACT_LAW] = f"the exact law replaces {control.settings.law}: {answer.fallback}"
     if problem:
         warnings[CompensatorWarning.TERMS_REFUSED] = f"gravity compensation alone: {problem}"
     if answer.remainder:
