@@ -133,11 +133,11 @@ def _run(options: argparse.Namespace) -> int:
     command: str = options.command
     check_output(options.output)
     if command == NEW:
-        from exo_gravity.lab.calibration.new import MEASURE, NewArm, write_new
+        from exo_gravity.lab.calibration.new import NewArm, write_new
 
         names = ("urdf", "motors", "ids", "joints", "hand", "side", "channel", "fd", "simulate")
         notes = write_new(NewArm(*(getattr(options, name) for name in names)), options.output)
-        print(*notes, f"Written: {options.output}; {MEASURE} in it marks what is still to be measured", sep="\n")
+        print(*notes, f"Written: {options.output}; MEASURE in it marks what is still to be measured", sep="\n")
         return 0
     if command == ACCEPTANCE:
         from exo_gravity.lab.acceptance import Weight, accept_arm

@@ -59,7 +59,7 @@ def test_the_written_file_takes_limits_torques_and_home_from_urdf_and_motors(tmp
     assert "by its URDF the arm hangs at abduction 1, flexion 0, elbow 0 degrees" in ended.out
     arm = read_arm(load(output), "/right")
     assert arm.limits.position_max == (1.9, 2.3, 2.3) and arm.limits.position_min[2] == -0.1  # it hangs at 0
-    assert arm.limits.max_effort == (9.0, 9.0, 3.0)
+    assert arm.limits.max_effort == (9.0, 9.0, 3.0) and arm.compensator["wearer.links"] == [2, 3]
     assert arm.can_bridge["can.channel"] == "can1" and not arm.can_bridge["autostart"]
     assert max(map(abs, arm.settings.torque(arm.limits.home, Tilt.of("right"))[0])) < 0.01
     output.unlink()
@@ -120,6 +120,7 @@ UNFIT = {
     "a motor without CAN FD": (["--fd"], "motors = 'AK80-9': must be one of DM-.* on CAN FD"),
     "no such file": (["--urdf", "none.urdf"], "urdf.file = 'none.urdf': must be a URDF file"),
     "no such link": (["--hand", "claw"], "urdf.hand = 'claw': must be a link of the URDF"),
+    "out of order": (["--simulate", "--joints", "elbow", "abduction", "flexion"], "joints = .*: must be in the order"),
     "one ID twice": (["--ids", 1, 1, 2], "can_id = .*: must be 3 different IDs"),
 }
 

@@ -18,11 +18,11 @@ from scipy.optimize import minimize
 
 from exo_gravity.core.arm.tilt import Tilt
 from exo_gravity.core.errors import ParameterError
-from exo_gravity.core.motors.families import MOTORS
+from exo_gravity.core.motors.families import MOTORS, every_family
 from exo_gravity.hardware.urdf_arm import UrdfArm, read_urdf
 from exo_gravity.hardware.urdf_checks import robot_of
 from exo_gravity.lab.inputs.arms import read_arm
-from exo_gravity.lab.inputs.parameter_file import load, scalar
+from exo_gravity.lab.inputs.parameter_file import read, scalar
 
 LARGEST_ANGLE = 3.1  # rad, of a joint without limits
 POSES = 2000  # at random, for gravity's largest torque
@@ -31,7 +31,7 @@ LITTLE = 0.02  # Nm of a joint at rest, and J, that count as none
 INSIDE = 0.1  # rad by which the limits are inside the URDF's: a start moves each joint a little
 SIMULATED_BUS = "interface: udp_multicast, channel: 239.74.163.9, options: {port: 43119, hop_limit: 0"
 DAMIAO_TIMEOUT = 0.3  # s
-MEASURE = "MEASURE"
+SEGMENT = 0.12  # m, from which a link is one that an upper arm or a forearm lies along
 PLAUSIBLE_ANGLE = 2.1 * math.pi  # rad; robots whose joints turn both ways have limits of ±2 pi
 PLAIN = re.compile(r"[A-Za-z][\w./-]*", re.ASCII)
 
@@ -65,6 +65,7 @@ class NewArm:
         return self.urdf if self.urdf.startswith("package://") else str(Path(self.urdf).absolute())
 
     def __post_init__(self) -> None:
+        every_family()  # those of other distributions, too
         fit = [name for name, spec in MOTORS.items() if spec.can_fd or not self.fd]
         for motor in self.motors:
             if motor not in fit:
@@ -126,8 +127,9 @@ def hanging(arm: UrdfArm, low: np.ndarray, high: np.ndarray) -> np.ndarray:
         return np.asarray(minimize(energy, start, jac=lambda pose: torques(pose[None])[0], bounds=within).x)
 
     within = np.stack((low, high), axis=1)
-    starts = np.random.default_rng(0).uniform(low, high, (STARTS, count))
-    best = min((fall(start, within) for start in starts), key=energy)
+    best = min(
+        (fall(start, within) for start in np.random.default_rng(0).uniform(low, high, (STARTS, count))), key=energy
+    )
     for joint in range(count):
         nearer = within.copy()
         nearer[joint] = np.clip(0.0, low[joint], high[joint])
@@ -159,24 +161,26 @@ def write_new(new: NewArm, output: Path) -> list[str]:
     if not len(names) == len(new.motors) == len(new.ids):
         expected = f"one motor and one ID for each of the joints {', '.join(names) or '(none of the URDF turns)'}"
         raise ParameterError("motors and ids", [*new.motors, *new.ids], expected)
+    in_order = [name for name in known if name in names]
+    if new.simulate and names != in_order:
+        raise ParameterError("joints", names, f"in the order of the URDF for a simulated arm: {', '.join(in_order)}")
     arm = UrdfArm(text, names, new.hand)
     ranges = [known[name] for name in names]
     low, high = np.transpose([(edge.low, edge.high) for edge in ranges])
     poses = np.random.default_rng(0).uniform(low, high, (POSES, len(names)))
     needed = np.max(np.abs(arm.torques(poses, np.tile(Tilt.of("left").direction, (POSES, 1)))), axis=0)
-    rated = [MOTORS[motor].rated_torque for motor in new.motors]
-    efforts = [min(most, own or most) for most, own in zip(rated, arm.max_effort, strict=True)]
+    efforts = [
+        min(MOTORS[motor].rated_torque, own or math.inf) for motor, own in zip(new.motors, arm.max_effort, strict=True)
+    ]
     home = hanging(arm, low, high)
     notes = [*arm.notes, *(edge.note for edge in ranges if edge.note), *on_stops(arm, names, home)]
     for name, effort, most in zip(names, efforts, needed.tolist(), strict=True):
         if most > effort:
             notes.append(f"{name}: gravity takes up to {most:.1f} Nm of it, max_effort is {effort:g} Nm")
-    output.write_text(_file(new, names, ranges, efforts, needed.tolist(), home.round(3).tolist()), encoding="utf-8")
-    try:
-        read_arm(load(output), f"/{new.side}")
-    except ParameterError:
-        output.unlink()
-        raise
+    worn = [0, 0, *(n for n, length in enumerate(arm.length, start=1) if length > SEGMENT)][-2:]
+    text = _file(new, names, ranges, efforts, needed.tolist(), home.round(3).tolist(), worn)
+    read_arm(read(text, str(output)), f"/{new.side}")
+    output.write_text(text, encoding="utf-8")
     return notes
 
 
@@ -187,10 +191,14 @@ def _file(
     efforts: Sequence[float],
     needed: Sequence[float],
     home: Sequence[float],
+    worn: Sequence[int],
 ) -> str:
-    """Return the text of the parameter file."""
+    """Return the text of the parameter file.
+
+    worn: links that carry upper arm and forearm, from 1 on; 0 for none.
+    """
     count, simulator = len(names), ""
-    timeouts = [0.0 if MOTORS[motor].family == "ak" else DAMIAO_TIMEOUT for motor in new.motors]
+    timeouts = [DAMIAO_TIMEOUT if MOTORS[motor].family == "damiao" else 0.0 for motor in new.motors]
     edges = [edge.inside(angle) for edge, angle in zip(ranges, home, strict=True)]
     urdf = f"{{file: {json.dumps(new.file, ensure_ascii=False)}, hand: {json.dumps(new.hand, ensure_ascii=False)}}}"
     start = "autostart: false  # an operator arms it\n    rate: 250.0"
@@ -215,20 +223,19 @@ def _file(
     home: {_row(home)}  # rad, where it begins
     friction: {{coulomb: {_row([0.1] * count)}, viscous: {_row([0.02] * count)}}}  # Nm, Nm s/rad
 """
-    listed = _row(names)
     return f"""# Written by `calibrate new` from {" ".join(new.urdf.split())}.
-# {MEASURE} marks what only the arm itself can tell: docs/first_arming.md.
+# MEASURE marks what only the arm itself can tell: docs/first_arming.md.
 
 /{new.side}/can_bridge:
   ros__parameters:
-    joint_names: {listed}
+    joint_names: {_row(names)}
     {start}
     can: {new.bus}
     motor: {_row(new.motors)}
     can_id: {_row(new.ids)}
-    direction: {_row([1] * count)}  # {MEASURE}: 1 or -1, so that a positive angle is that of the URDF
-    zero: {_row([0.0] * count)}  # {MEASURE}: rad, the motor's angle where the joint's angle is 0
-    torque_scale: {_row([1.0] * count)}  # {MEASURE}: real Nm per commanded Nm
+    direction: {_row([1] * count)}  # MEASURE: 1 or -1, so that a positive angle is that of the URDF
+    zero: {_row([0.0] * count)}  # MEASURE: rad, the motor's angle where the joint's angle is 0
+    torque_scale: {_row([1.0] * count)}  # MEASURE: real Nm per commanded Nm
     motor_timeout: {_row(timeouts)}  # s, as set in the motors
     position_min: {_row([low for low, _ in edges])}  # rad, {INSIDE:g} inside the URDF's where the arm hangs farther off
     position_max: {_row([high for _, high in edges])}
@@ -239,10 +246,11 @@ def _file(
   ros__parameters:
     law: urdf
     urdf: {urdf}
-    joint_names: {listed}
+    joint_names: {_row(names)}
     use_imu: false  # true with an IMU on the trunk: docs/imu.md
     max_effort: {_row(efforts)}
     mode: one_g
+    wearer: {{links: {_row(worn)}}}  # MEASURE: the links that carry upper arm, and forearm and hand; 0: none
 {simulator}"""
 
 

@@ -265,7 +265,7 @@ def load(path: str | Path) -> Nodes:
     except OSError as error:
         raise ParameterError("params", str(path), f"a readable file ({error.strerror})") from None
     except (yaml.YAMLError, UnicodeDecodeError) as error:
-        raise ParameterError("params", str(path), f"YAML ({' '.join(str(error).split())})") from None
+        raise ParameterError("params", str(path), f"YAML without tabs ({' '.join(str(error).split())})") from None
     _check_together(nodes)
     return nodes
 
