@@ -51,7 +51,8 @@ def exit_code(tool: str, extra: str, work: Callable[[], int]) -> int:
         _give_up_output()
         return 141
     except (ExoGravityError, OSError) as error:
-        print(f"{tool}: {error}", file=sys.stderr)
+        what = f"{error.filename}: {error.strerror}" if isinstance(error, OSError) and error.filename else error
+        print(f"{tool}: {what}", file=sys.stderr)
         _give_up_output()
         return 2
 

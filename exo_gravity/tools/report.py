@@ -12,6 +12,7 @@ use, or part of a recording could not be read; the rest is reported first.
 import argparse
 import math
 import os
+import time
 from collections.abc import Callable, Iterable, Sequence
 from functools import partial
 from glob import glob
@@ -91,7 +92,7 @@ def _run(options: argparse.Namespace) -> int:
     )
     given = {name: value for name in ("width", "font") if (value := getattr(options, name))}
     on_paper = html.Print(options.figures, **given)
-    (path, *more), screen = options.bag, Console(stderr=True)
+    (path, *more), screen, began = options.bag, Console(stderr=True), time.time() - 0.1  # a file's time is coarse
     beside = path.resolve().with_name(f"{path.resolve().stem}_report")
     if more or options.scheduler or (path.is_dir() and cohort.recordings_below(path) not in ([], [path])):
         return _run_cohort(options, criteria, on_paper, Path(options.output or beside))
@@ -105,7 +106,7 @@ def _run(options: argparse.Namespace) -> int:
     if clip:
         clip.write(bag, screen)
     trial_report.print_report(report)
-    print(f"Written: {', '.join(path.name for path in written)} in {written[0].parent}")
+    print(f"Written: {', '.join(path.name for path in written if path.stat().st_mtime > began)} in {output}")
     return report.exit_code
 
 
@@ -160,18 +161,16 @@ def _run_cohort(options: argparse.Namespace, criteria: HoldCriteria, on_paper: h
     tables = study.tables_of(trials, conditions, compared)
     readable = [*{row["recording"]: None for row in rows if row["verdict"]}]
     _export(options, output, lambda: (read_bag(recording, options.decimate) for recording in readable))
-    stamp = STAMPS[of_all(Source(row["source"]) for row in trials if row["verdict"])]
-    drawn = study.figure(trials, keys)
-    png = html.saved(drawn, output / "cohort.png", stamp, on_paper) if drawn else b""
+    source = of_all(Source(row["source"]) for row in trials if row["verdict"])
+    figure = study.figure(trials, keys)
+    png = html.saved(figure, output / "cohort.png", STAMPS[source], on_paper) if figure else b""
     name = options.bag[0].resolve().stem if len(options.bag) == 1 else f"{len(recordings)} recordings"
     (output / "cohort.html").write_text(study.page(trials, name, tables, png), encoding="utf-8")
     console = Console(highlight=False, width=None if Console().is_terminal else 200)
     study.print_trials(trials, tables, console)
     console.print(study.summary_of(trials), soft_wrap=True)
     console.print(f"Written: cohort.html, its figure and tables in {output}", markup=False, soft_wrap=True)
-    if study.problems_of(trials):
-        return 2
-    return int(not all(row["held"] for row in trials))
+    return 2 if study.problems_of(trials) else int(not all(row["held"] for row in trials))
 
 
 main = command("report", "report", _arguments, _run)

@@ -142,8 +142,8 @@ def test_a_let_down_has_the_peak_speed_of_each_joint_until_the_wearer_moves_the_
     assert (down.kind, down.start) == ("let down", 17.0)
     peak = 1.875 * np.abs(POSE_A - HANGING) / 4.0  # of a minimum-jerk motion in 4 s
     np.testing.assert_allclose(down.speed, peak, atol=2 * VELOCITY_CODE)
-    steps = (*STOPPED_IN_A_HOLD[:1], ScriptedStep("hold", 7.0, 18.0), ScriptedStep("move", 18.0, 20.0))
-    down = analyse(carried_until(17.0, steps)).motions[-1]
+    then = (("hold", 7.0, 17.5), ("hold", 17.5, 18.0), ("move", 18.0, 20.0))
+    down = analyse(carried_until(17.0, (*STOPPED_IN_A_HOLD[:1], *(ScriptedStep(*step) for step in then)))).motions[-1]
     assert (down.kind, down.start, down.end) == ("let down", 17.0, 18.0)
     pieces = (still(POSE_A, 5.0), smooth(POSE_A, POSE_A - 0.1, 4.0), smooth(POSE_A - 0.1, POSE_A, 2.0))
     twice = recording(*pieces, still(POSE_A, 5.0), carried=((0.0, 5.0), (10.0, 16.0)))

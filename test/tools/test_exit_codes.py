@@ -38,6 +38,7 @@ WRONG = [
     ("budget", ["--body-mass", "75", *NO_FILE], "nowhere.yaml"),
     *(("budget", [*BUDGET, mass], "must be a number from") for mass in ("75000", "nan")),
     ("budget", [*BUDGET, "75", "--support", "2"], "must be a number from"),
+    ("budget", [*BUDGET, "75", "--output", "/proc/none"], "budget: /proc/none: No such file"),
     ("calibrate", ["motor"], "invalid choice"),
     ("calibrate", [*IMU, "new.yaml", "--bag", "none"], "must be a recording that exists"),
     ("calibrate", [*IMU, "taken.yaml", "--bag", "."], "taken.html': must be a new file"),

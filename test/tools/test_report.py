@@ -148,7 +148,10 @@ def test_the_report_is_written_next_to_its_recording_and_on_request_time_series_
     }
     nowhere = run_tool("report", short_bag, "--output", short_bag / "metadata.yaml" / "report")
     assert nowhere.code == 2 and "cannot write the report there" in nowhere.err
-    assert run_tool("report", short_bag, "--output", tmp_path, "--csv").code == 0
+    assert [
+        "time_series.csv" in run_tool("report", short_bag, "--output", tmp_path, *words).out
+        for words in (("--csv",), ())
+    ] == [True, False]
     rows, (recording,) = csv_rows(tmp_path / "time_series.csv"), read_bag(short_bag).recordings
     elbow = [row for row in rows if row["joint"] == recording.joint_names[3]]
     values = (recording.time, recording.position[:, 3], recording.velocity[:, 3], recording.effort[:, 3])

@@ -244,7 +244,7 @@ def _last_motions(recording: Recording, blocks: Blocks, last: Span) -> Iterator[
     if end - last[1] > MIN_HOLD:
         yield _motion(recording, blocks, last, (end, end))
     # A virtual wearer continues with the next step even if the arm is not carried. That is not part of the let-down.
-    going_on = (step.start for step in recording.steps if step.start > released and step.action != "done")
+    going_on = (s.start for s in recording.steps if s.start > released and s.action not in ("hold", "done"))
     down = min([recorded, *going_on])
     if down - released > blocks.length:
         yield _motion(recording, blocks, (last[0], released), (down, down))
