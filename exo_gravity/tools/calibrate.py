@@ -38,9 +38,9 @@ COMMANDS = {
     "friction": ("tours", "friction of each joint, from slow sweeps"),
     "scale": ("tours", "torque scale of each motor, from a known weight on the last link"),
     "wearer": ("wearer", "the moments of the wearer's relaxed arm"),
-    "check": ("tours", "nothing: whether a few poses still need the torque of the last calibration"),
+    "check": ("tours", "whether a few poses still need the torque of the last calibration"),
     "imu": ("imu", "the mounting of the IMU, from standing upright and bowing"),
-    ACCEPTANCE: ("", "nothing: a record (JSON) of what the first real, unworn arm shows on the bench, step by step"),
+    ACCEPTANCE: ("", "a record (JSON) of what the first real, unworn arm shows on the bench, step by step"),
 }
 
 
@@ -135,8 +135,9 @@ def _run(options: argparse.Namespace) -> int:
     if command == NEW:
         from exo_gravity.lab.calibration.new import NewArm, write_new
 
-        names = ("urdf", "motors", "ids", "joints", "hand", "side", "channel", "fd", "simulate")
-        notes = write_new(NewArm(*(getattr(options, name) for name in names)), options.output)
+        notes = write_new(
+            NewArm(**{name: getattr(options, name) for name in NewArm.__dataclass_fields__}), options.output
+        )
         print(*notes, f"Written: {options.output}; MEASURE in it marks what is still to be measured", sep="\n")
         return 0
     if command == ACCEPTANCE:
@@ -162,7 +163,7 @@ def _run(options: argparse.Namespace) -> int:
         person.say(line)
     if result.changes and not result.refusals:
         write_changes(options.params, options.output, result.changes, f"calibrate {command}")
-        person.say(f"Written: {options.output}")
+        person.say(f"Written: {options.output}, to use in place of {options.params}")
     if not result.refusals or result.observations:
         page.write_text(page_of(result, command, str(options.params)), encoding="utf-8")
         person.say(f"Written: {page}")

@@ -39,6 +39,7 @@ def _run(options: argparse.Namespace) -> int:
     text = urdf_of(options.params, options.side, options.meshes)
     if options.output:
         Path(options.output).write_text(text, encoding="utf-8")
+        print(f"Written: {options.output}")
     else:
         print(text, end="")
     return 0

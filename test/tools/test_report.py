@@ -218,7 +218,7 @@ def test_a_recording_without_a_hold_is_reported_with_figures_and_1_and_of_nothin
 LIMITED = {  # what differs of the recording, which is carried until s; what is said, and the exit code
     "unknown when it was carried": ({}, None, "when the arm was carried", 0),
     "cut short": ({}, 15.0, "15.0 s, before the script ended", 0),
-    "no script": ({"steps": ()}, math.inf, "no trial script", 0),
+    "no script": ({"steps": ()}, math.inf, "no step of a script", 0),
 }
 
 

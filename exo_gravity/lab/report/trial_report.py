@@ -242,7 +242,7 @@ def _reservations(bag: Bag) -> Iterator[str]:
     """Yield what is missing, and what the report does instead."""
     unscripted = [recording.name for recording in bag.recordings if not recording.steps]
     if unscripted:
-        yield f"{', '.join(unscripted)}: the recording has no trial script: every still phase is taken for a hold"
+        yield f"{', '.join(unscripted)}: no step of a script was recorded: every still phase is taken for a hold"
     unknown = [recording.name for recording in bag.recordings if recording.carried is None]
     if unknown:
         names = ", ".join(unknown)
