@@ -25,7 +25,7 @@ from exo_gravity.core.motors.frames import MotorSpec, WireFormat
 from exo_gravity.core.params import Param
 from exo_gravity.core.safety.command import FaultCode
 from exo_gravity.core.safety.limits import CAN_BRIDGE
-from exo_gravity.core.trunk.params import IMU
+from exo_gravity.core.trunk.checks import IMU
 from exo_gravity.lab.bag.content import RECORDER
 from exo_gravity.lab.view import ROBOT_MODEL
 from exo_gravity.panel.control import PANEL

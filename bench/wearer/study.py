@@ -43,7 +43,7 @@ TRUNK: tuple[dict[str, Any], ...] = (
     {"hold": 13.0}, {"bow": 0.4, "over": 1.2}, {"hold": 3.0}, {"bow": 0.0, "over": 1.2}, {"hold": 8.0}, {"walk": 8.0},
     {"hold": 9.6},
 )  # fmt: skip
-TILT_NOISE = math.radians(0.6)  # of the filter, as core/trunk/uncertainty.py has it; it stays for about
+TILT_NOISE = math.radians(0.6)  # of the filter, as hardware/trunk_estimator.py has it; it stays for about
 TILT_TIME = 3.0  # s
 KINDS = ("reach", "hold", "rest", "trunk in motion")
 STIFFNESS, DAMPING, INTEGRAL = (15.0, 25.0, 20.0, 8.0), (1.0, 2.0, 1.5, 0.5), (15.0, 25.0, 20.0, 8.0)

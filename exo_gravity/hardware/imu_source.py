@@ -1,7 +1,7 @@
 # Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
 """An IMU that the node `imu` reads itself, and one that is opened again after it was unplugged.
 
-An entry point of the group GROUP (core/trunk/params.py) names what opens it, given the parameters' values and the clock
+An entry point of the group GROUP (core/trunk/checks.py) names what opens it, given the parameters' values and the clock
 of the stamps; its name is that of the parameter `source`. It raises DeviceError, and ParameterError if a value does not
 suit the device. Ours are chips (lab/imu_chips.py).
 """

@@ -22,8 +22,8 @@ from exo_gravity.core.arm.tilt import SIDES, Tilt
 from exo_gravity.core.errors import ParameterError
 from exo_gravity.core.numbers import Rate
 from exo_gravity.core.params import loaded
+from exo_gravity.core.trunk.checks import GROUP, IMU
 from exo_gravity.core.trunk.inputs import NOT_REPORTED, check_trunk
-from exo_gravity.core.trunk.params import GROUP, IMU
 from exo_gravity.core.vocabulary import NONE, UNKNOWN, ImuState
 from exo_gravity.hardware.clock import COMPUTER_CLOCK, Clock
 from exo_gravity.hardware.imu_source import Reopening

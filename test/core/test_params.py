@@ -36,8 +36,8 @@ from exo_gravity.core.motors.frames import pack_command
 from exo_gravity.core.motors.joint_motor import JointMotor, Traffic, buses_of, motors_of, traffic_of
 from exo_gravity.core.params import GONE, in_force, values_of
 from exo_gravity.core.safety.limits import CAN_BRIDGE, Limits, check_bridge, limits_of
+from exo_gravity.core.trunk.checks import IMU
 from exo_gravity.core.trunk.inputs import FeltMotion
-from exo_gravity.core.trunk.params import IMU
 from exo_gravity.hardware.motor_bus import MotorBus
 from exo_gravity.hardware.trunk_estimator import TrunkEstimator
 from exo_gravity.hardware.urdf_arm import UrdfArm

@@ -11,8 +11,7 @@ from exo_gravity.core.arm.paper import ArmModel, mobile_torque, static_torque
 from exo_gravity.core.arm.tilt import Tilt, angle_between, gravity_in_trunk, pitch_roll, rotation_matrix
 from exo_gravity.core.errors import ParameterError
 from exo_gravity.core.trunk.inputs import FELT, TILT, FeltMotion, TiltInput
-from exo_gravity.core.trunk.uncertainty import MODEL, TiltUncertainty
-from exo_gravity.hardware.trunk_estimator import TUNING, VqfFusion
+from exo_gravity.hardware.trunk_estimator import MODEL, TUNING, TiltUncertainty, VqfFusion
 
 from ..support import ROBOT
 from ..support.compensator_run import THETA, CompensatorRun

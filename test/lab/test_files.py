@@ -12,7 +12,7 @@ from exo_gravity.core.errors import ParameterError
 from exo_gravity.core.motors.joint_motor import OPTIONS
 from exo_gravity.core.params import values_of
 from exo_gravity.core.safety.limits import CAN_BRIDGE, CONFIRM
-from exo_gravity.core.trunk.params import IMU
+from exo_gravity.core.trunk.checks import IMU
 from exo_gravity.core.vocabulary import Source
 from exo_gravity.lab.bag.content import Session
 from exo_gravity.lab.inputs.arms import configured_arms, read_arm

@@ -16,7 +16,7 @@ from scipy.spatial.transform import Rotation
 from sensor_msgs.msg import Imu
 
 from exo_gravity.core.errors import ParameterError
-from exo_gravity.core.trunk.params import GROUP
+from exo_gravity.core.trunk.checks import GROUP
 from exo_gravity.hardware.imu_source import ImuSource
 from exo_gravity.hardware.network import restrict_to_localhost
 from exo_gravity.hardware.trunk_estimator import ImuSample, TrunkEstimator

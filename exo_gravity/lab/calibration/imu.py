@@ -26,8 +26,7 @@ from exo_gravity.core.arm.interface import STANDARD_GRAVITY
 from exo_gravity.core.arm.tilt import Tilt, angle_between
 from exo_gravity.core.errors import DataError, ParameterError
 from exo_gravity.core.numbers import Vector
-from exo_gravity.core.trunk.checks import reported_orientation, reported_vector
-from exo_gravity.core.trunk.params import IMU
+from exo_gravity.core.trunk.checks import IMU, reported_orientation, reported_vector
 from exo_gravity.hardware.trunk_estimator import ImuSample, TrunkEstimator
 from exo_gravity.lab.calibration.identification import Identified
 from exo_gravity.lab.calibration.live import Say

@@ -5,7 +5,7 @@ from exo_gravity.core.compensation.settings import COMPENSATOR, compensator_tabl
 from exo_gravity.core.errors import BusError, named
 from exo_gravity.core.motors.joint_motor import buses_of, motors_of, traffic_of
 from exo_gravity.core.safety.limits import CAN_BRIDGE, check_bridge, limits_of
-from exo_gravity.core.trunk.params import IMU
+from exo_gravity.core.trunk.checks import IMU
 from exo_gravity.hardware.bus_lock import bridge_of
 from exo_gravity.hardware.network import check_environment
 from exo_gravity.hardware.trunk_estimator import TrunkEstimator
