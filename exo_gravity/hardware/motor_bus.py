@@ -44,14 +44,12 @@ from exo_gravity.core.motors.frames import (
 from exo_gravity.core.motors.joint_motor import UNKNOWN, JointMotor, JointSample
 from exo_gravity.core.numbers import rate_limited
 from exo_gravity.core.safety.command import Command, Send
-from exo_gravity.core.safety.limits import DAMPING
+from exo_gravity.core.safety.limits import DAMPING, EQUIPMENT
 from exo_gravity.hardware.can_port import CanPort, awaited
 from exo_gravity.hardware.clock import COMPUTER_CLOCK, Clock
 from exo_gravity.hardware.request_age import Requests
 
-LAST_REPLIES = 0.02  # s for which replies to the last frames are awaited
 LISTEN_TIME = 0.12  # s before the first frame
-LATE_REPLIES = 0.02  # s of it in which replies to the previous owner may still arrive
 CORRECTION_PERIOD = 0.001  # s between two corrections of a motor: two correcting hosts must not fill the bus
 CONTEST_TIME = 0.5  # s after a foreign command in which another one is expected; the hold fades meanwhile
 HOLD_STIFFNESS = 60.0  # Nm/rad by which a contested motor holds its joint: the motor applies it without our delay,
@@ -136,7 +134,7 @@ class MotorBus:
         """Listen before the first frame. Raises BusError if another host commands these motors."""
         self._failed.clear()
         end = self._now() + LISTEN_TIME
-        self.receive_until(end - LISTEN_TIME + LATE_REPLIES)
+        self.receive_until(end - LISTEN_TIME + EQUIPMENT.late)
         self._answered.clear()
         self.foreign_commands = 0
         self.receive_until(end)
@@ -218,7 +216,9 @@ class MotorBus:
             for joint in left:
                 self._send(self._ports[joint], *self.motors[joint].exit)
             with contextlib.suppress(BusError):
-                self.receive_until(self._now() + LAST_REPLIES, lambda: self._answered >= self._asked.intersection(left))
+                self.receive_until(
+                    self._now() + EQUIPMENT.late, lambda: self._answered >= self._asked.intersection(left)
+                )
         self.close()
 
     def close(self) -> None:

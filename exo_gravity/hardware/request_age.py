@@ -20,16 +20,18 @@ import math
 from collections import deque
 from dataclasses import dataclass
 
+from exo_gravity.core.safety.limits import EQUIPMENT
+
 
 @dataclass(frozen=True)
 class ReplyAge:
     """When replies are too old."""
 
-    longest: float = 0.04  #: s; a computer is late by 0.02 s; a pause as long must not silence a motor (0.05 s)
+    longest: float = 2.0 * EQUIPMENT.late  #: s; a pause as long must not silence a motor (`reply_timeout`)
     fewest: int = 3  #: commands under way: at a low rate one or two may be longer than `longest`
-    quiet: float = 0.02  #: s without a reply that show that none is under way; an adapter's longest timer is 0.016 s
+    quiet: float = 1.25 * EQUIPMENT.timer  #: s without a reply that show that none is under way
     looks: int = 3  #: cycles of it at least
-    late: float = 0.015  #: s; a pause and a computer that is late by 0.02 s together would make a motor silent
+    late: float = 0.75 * EQUIPMENT.late  #: s; a pause and a computer that is late would make a motor silent
     #: s beyond a period that pass between two looks at most: where more have, this process or the whole computer stood
     #: still, and the replies that wait are no older than others
     look: float = 0.005

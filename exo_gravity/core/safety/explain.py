@@ -28,7 +28,7 @@ from exo_gravity.core.arm.tilt import SIDES, Tilt
 from exo_gravity.core.motors.joint_motor import JointSample
 from exo_gravity.core.numbers import clamp
 from exo_gravity.core.safety.command import Fault, FaultCode
-from exo_gravity.core.safety.limits import Limits
+from exo_gravity.core.safety.limits import EQUIPMENT, Limits
 
 GRAVITY = 9.81  # m/s^2
 # Axes and links of the paper's arm in its base frame while all angles are 0 (Table 1): x outwards, y forwards, z down.
@@ -45,7 +45,6 @@ class MotionLimits:
     surplus: float = 1.1  #: times the largest moments
     least: float = 0.1  #: Nm of margin
     share: float = 0.1  #: of the full load, in addition: 6 degrees of the trunk's tilt
-    late: float = 0.02  #: s by which a torque that is fresh may answer an old pose
     still: float = 0.01  #: rad by which pose or trunk may turn before the range is computed anew
     slow: float = 0.1  #: s, time constant; faster than this, torque changes only with the pose
     patience: float = 0.012  #: s of the full load
@@ -128,7 +127,7 @@ class MotionMonitor:
         for i, full in enumerate(self.full):
             most = self._limits.max_effort[i]
             torque = clamp(effort[i], most)
-            share = MOTION.share + max(MOTION.late, age) * fastest
+            share = MOTION.share + max(EQUIPMENT.late, age) * fastest  # a fresh torque may answer an old pose
             margin = MOTION.least + self._limits.largest_addition[i] + share * full
             low, high = lowest[i] - margin, highest[i] + margin
             within = max(low, min(high, torque))

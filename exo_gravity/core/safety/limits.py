@@ -39,6 +39,29 @@ MAX_EFFORT_RATE = 50.0  # Nm/s; the full torque of an AK60-6 in 60 ms, slow enou
 
 
 @dataclass(frozen=True)
+class Equipment:
+    """What ordinary equipment does. Time-outs leave room for it, and are computed from it where they can be.
+
+    A worse bus or computer needs a lower `rate`, or longer `command_timeout` and `frozen_timeout`.
+    """
+
+    late: float = 0.02  #: s by which a busy computer runs a cycle, or hands on a message, too late
+    lost: float = 0.03  #: share of the frames that are lost, each way
+    timer: float = 0.016  #: s, the longest latency timer of a USB adapter
+
+
+EQUIPMENT = Equipment()
+
+
+def in_a_row(rate: float, rarely: float) -> int:
+    """Return how many commands in a row one of four motors leaves unanswered once in `rarely` s at `rate` Hz.
+
+    Lost frames alone are the reason: of the command, or of its reply.
+    """
+    return math.ceil(math.log(4.0 * rate * rarely) / -math.log(1.0 - (1.0 - EQUIPMENT.lost) ** 2))
+
+
+@dataclass(frozen=True)
 class SoftWall:
     """What holds a joint back before its limit.
 
@@ -68,10 +91,9 @@ class ReadingLimits:
     fastest: Sequence[float] = (5.0, 5.0, 5.0, 6.0)  #: rad/s, the usual `max_velocity`
     shock: float = 0.03  #: s above `max_velocity`, by half of it at most, that a slap on a table lasts
     overshoot: float = 0.1  #: rad past a joint limit: mechanical stops are not infinitely stiff
-    missed: int = 7  #: commands without a reply; with 3 % lost each way an arm misses so many once in 270 h at 100 Hz
-    #: commands without a reply, after which a motor is late; with 3 % lost each way, one of four once in 80 s at 250 Hz
-    late: int = 4
-    reply_timeout: float = 0.05  #: s, and `missed` commands at least; an ordinary computer is late by 0.02 s
+    missed: int = in_a_row(100.0, 250.0 * 3600.0)  #: commands without a reply, after which a motor may be silent: 7
+    late: int = in_a_row(250.0, 80.0)  #: commands without a reply, after which a motor is late: 4
+    reply_timeout: float = 2.5 * EQUIPMENT.late  #: s, and `missed` commands at least
 
 
 WALL, HEAT, READING = SoftWall(), Derating(), ReadingLimits()

@@ -13,7 +13,7 @@ import numpy as np
 from exo_gravity.core.motors.joint_motor import JointSample
 from exo_gravity.core.numbers import rate_limited
 from exo_gravity.core.safety.command import Fault, FaultCode, Send
-from exo_gravity.core.safety.limits import MAX_EFFORT_RATE, Limits
+from exo_gravity.core.safety.limits import EQUIPMENT, MAX_EFFORT_RATE, Limits
 from exo_gravity.core.vocabulary import NO_REASON, Reason, Wait
 
 # The gate waits for these to pass; other faults refuse the start.
@@ -38,8 +38,6 @@ class SwitchOn:
     torque: float = 0.4  #: Nm, each way
     time: float = 0.06  #: s, each way
     share: float = 0.5  #: of the test torque that must appear in the replies
-    #: s, time constant: replies are one command old and behind a current loop, a batch, a stall
-    lag: float = 0.02
     timeout: float = 0.48  #: s until every motor has shown that it is on: four pushes each way
     attempts: int = 6  #: to switch motors on again that show no torque in the sign check; each may miss 3 % of frames
 
@@ -274,7 +272,8 @@ class SwitchOnCheck:
         self._elapsed += dt
         self.enter = [False] * len(self.enter)
         for i, joint in enumerate(joints):
-            self._commanded[i] += min(1.0, dt / SWITCH_ON.lag) * (self.effort[i] - self._commanded[i])
+            # Replies are one command old, and behind a current loop, a batch or a stall.
+            self._commanded[i] += min(1.0, dt / EQUIPMENT.late) * (self.effort[i] - self._commanded[i])
             if joint.time > self._last_time[i]:
                 self._last_time[i] = joint.time
                 replied = joint.effort + damping[i] * joint.velocity

@@ -50,7 +50,7 @@ from enum import Enum
 
 from exo_gravity.core.motors.joint_motor import UNKNOWN, JointMotor, JointSample
 from exo_gravity.core.safety.command import Fault, FaultCode, Send
-from exo_gravity.core.safety.limits import HEAT, READING, Limits
+from exo_gravity.core.safety.limits import EQUIPMENT, HEAT, READING, Limits
 
 
 @dataclass(frozen=True)
@@ -110,7 +110,7 @@ class Delivery:
 class Stall:
     """What a fall in a pause of the loop looks like."""
 
-    late: float = 0.03  #: s beyond the period of the loop; ordinary computers are late by 0.02 s
+    late: float = 1.5 * EQUIPMENT.late  #: s beyond the period of the loop
     least: float = 0.5  #: Nm that a motor must have applied: a joint that carries nothing falls nowhere
     #: rad/s that a joint gains against that torque: a fall of 20 ms under gravity alone, or a wearer's hard push
     gained: float = 0.3
