@@ -82,4 +82,6 @@ def test_a_laboratory_s_own_motor_term_and_law_need_no_fork_and_all_bounds_hold(
     both = ({"use_imu": False, "law": law} for law in ("our_half", "exact"))
     arms = (Compensator(settings_of(values_of(COMPENSATOR, given))) for given in both)
     torques = [arm.step(1.0, (0.1, 0.2, 0.3, 0.4), (0.0,) * 4).effort for arm in arms]
-    assert np.divide(*np.array(torques)[:, 1:]).tolist() == pytest.approx([0.5] * 3)  # gravity does not turn the first joint
+    assert np.divide(*np.array(torques)[:, 1:]).tolist() == pytest.approx(
+        [0.5] * 3
+    )  # gravity does not turn the first joint
