@@ -111,7 +111,7 @@ class TouchWatch:
             self._passed = self._passed + dt * (self._known + self._touch)
             self._touch = gain * (momentum - self._passed)
         else:
-            dt, self._touch, self._is_applied = 0.0, -carried, False
+            dt, self._touch, self._is_applied, self._free_for = 0.0, -carried, False, 0.0
             self._passed = momentum - self._touch / gain
         self.time, self._known = now, known
         allowed = TOUCH.share * np.abs(carried) + TOUCH.least
@@ -120,7 +120,7 @@ class TouchWatch:
         if speed <= (TOUCH.slow if is_applied else GUIDANCE.calm):
             self._is_applied = is_applied
         is_free = self._is_applied and is_loaded and np.all(np.abs(self._touch) <= allowed)
-        self._free_for = self._free_for + dt if is_free else 0.0
+        self._free_for = max(0.0, self._free_for + (dt if is_free else -0.5 * dt))  # noise is no touch
         return self._free_for >= TOUCH.time
 
 
