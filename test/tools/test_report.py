@@ -485,11 +485,14 @@ def test_a_folder_becomes_one_table_and_page_and_what_fails_is_named(trials, tmp
     assert "text.mcap: not an MCAP file" in page and page.count("<img ") == 1
     rows = csv_rows(out / "cohort.csv")
     assert len(rows) == 4 * len(made.NAMES) + 1
-    elbow = [float(row["drift_deg_per_min"]) for row in rows if row["joint"] == made.NAMES[3] and row["subject"]]
-    np.testing.assert_allclose(elbow, DRIFTS, atol=0.6)
+    below = [row for row in rows if row["joint"] == made.NAMES[3]]
+    for key, expected, within in (
+        ("drift_deg_per_min", DRIFTS, 0.6),
+        ("moved_in_step_deg", np.divide(DRIFTS, 15.0), 0.03),
+    ):
+        np.testing.assert_allclose([float(row[key]) for row in below if row["subject"]], expected, atol=within)
     first = [float(row["range_of_motion_deg"]) for row in rows if "day_0" in row["recording"]]
     np.testing.assert_allclose(np.radians(first), np.ptp(np.vstack((np.zeros(4), made.POSES)), axis=0), atol=0.01)
-    below = [row for row in rows if row["joint"] == made.NAMES[3]]
     assert all(0.0 < float(row["drift_uncertainty_deg_per_min"]) < 1.0 for row in below)
     assert re.search(r" [123]\.\d\d ± 0\.\d\d ", text)  # not 0.00 everywhere
 

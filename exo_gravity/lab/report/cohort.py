@@ -25,7 +25,7 @@ COLUMNS = (
     "recording", "date", "subject", "protocol", "arm", "source", "mode", "support", "held", "verdict", "problem",
     "holds", "held_s", "wearer_share", "smoothness_sparc", "joint",
     "drift_deg_per_min", "drift_uncertainty_deg_per_min",
-    "stray_in_10_s_deg", "range_of_motion_deg", "rms_torque_nm", "wearer_share_of_joint",
+    "stray_in_10_s_deg", "moved_in_step_deg", "range_of_motion_deg", "rms_torque_nm", "wearer_share_of_joint",
 )  # fmt: skip
 
 Row = dict[str, Any]  # by COLUMNS; None where unknown
@@ -85,6 +85,9 @@ def summary(path: str, criteria: HoldCriteria, min_hold: float, every: int) -> l
                 "drift_deg_per_min": float(drift),
                 "drift_uncertainty_deg_per_min": float(uncertainty),
                 "stray_in_10_s_deg": math.degrees(max((hold.stray[joint] for hold in holds), default=math.nan)),
+                "moved_in_step_deg": math.degrees(
+                    max((abs(release.offset[joint]) for release in analysis.releases), default=math.nan)
+                ),
                 "range_of_motion_deg": math.degrees(np.ptp(carried[:, joint])) if len(carried) else None,
                 "rms_torque_nm": float(np.mean([hold.torque_rms[joint] for hold in holds])) if holds else None,
                 "wearer_share_of_joint": part and float(part.joints.value[joint]),

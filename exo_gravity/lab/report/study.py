@@ -29,14 +29,15 @@ from exo_gravity.lab.report.trial_report import MODES
 LEGEND = 10  # lines at most that a figure names
 KEYS = ("protocol", "mode", "support")  # of a row, what may make a condition
 HEADINGS = (
-    "Subject", "Condition", "Date", "Recording", "Source", "Holds", "Drift\ndeg/min", "Within 10 s\ndeg", "Range\ndeg",
-    "SPARC", "Share\n%", "Verdict",
+    "Subject", "Condition", "Date", "Recording", "Source", "Holds", "Drift\ndeg/min", "Within 10 s\ndeg",
+    "In a step\ndeg", "Range\ndeg", "SPARC", "Share\n%", "Verdict",
 )  # fmt: skip
 TERMS = (
-    "Drift, movement within 10 s and range of motion are those of the joint that moved most; the drift has its "
-    "standard uncertainty, and one of 0 is less than that. SPARC is the smoothness of the moves from pose to pose: a "
-    "single bell-shaped movement has about -1.4, a jerky one less. Share is what the wearer carried of their arm's "
-    "weight."
+    "Drift, movements and range of motion are those of the joint that moved most. Drift and movement within 10 s are "
+    "those of an arm that is still; in a scripted hold, from release to its end, it may also sink or fall. The drift "
+    "has its standard uncertainty, and one of 0 is less than that. SPARC is the smoothness of the moves from pose to "
+    "pose: a single bell-shaped movement has about -1.4, a jerky one less. Share is what the wearer carried of their "
+    "arm's weight."
 )
 METHOD = (
     "Each wearer counts once in a condition, by the mean of their trials; among recordings of one wearer, or without "
@@ -66,6 +67,7 @@ class Measure(NamedTuple):
 MEASURES = (
     Measure("drift_deg_per_min", "drift", "deg/min", 2),
     Measure("stray_in_10_s_deg", "movement within 10 s", "deg", 2),
+    Measure("moved_in_step_deg", "movement in a scripted hold", "deg", 2),
     Measure("range_of_motion_deg", "range of motion", "deg", 1),
     Measure("smoothness_sparc", "smoothness (SPARC)", "", 2),
     Measure("wearer_share", "wearer's share", "%", 1, 100.0),
@@ -150,7 +152,7 @@ def trials_of(rows: Iterable[Row]) -> list[Row]:
     for _, group in groupby(rows, lambda row: (row["recording"], row["arm"])):
         joints = list(group)
         trial = dict(joints[0])
-        for key in ("drift_deg_per_min", "stray_in_10_s_deg", "range_of_motion_deg"):
+        for key in ("drift_deg_per_min", "stray_in_10_s_deg", "moved_in_step_deg", "range_of_motion_deg"):
             largest = max(joints, key=lambda row: abs(row[key] or 0.0))
             trial[key] = largest[key] and abs(largest[key])
             if key == "drift_deg_per_min":
@@ -172,14 +174,14 @@ def _series_of(trials: Iterable[Row], keys: Sequence[str]) -> Iterator[tuple[str
 
 def _cells(row: Row) -> list[str]:
     """Return the cells below HEADINGS; a dash where a number is unknown."""
-    drift, stray, reach, sparc, share = (
+    drift, stray, moved, reach, sparc, share = (
         "–" if row[one.key] is None else shown(one.of(row), one.digits) for one in MEASURES
     )
     if (uncertainty := row["drift_uncertainty_deg_per_min"]) is not None:
         drift = f"{drift} ± {uncertainty:.2f}" if row["drift_deg_per_min"] > uncertainty else f"<{uncertainty:.2f}"
     condition = str(Condition.of(row)) if row["verdict"] else ""
     texts = row["subject"], condition, row["date"], "/".join(Path(row["recording"]).parts[-2:]), row["source"]
-    numbers = "" if row["holds"] is None else str(row["holds"]), drift, stray, reach, sparc, share
+    numbers = "" if row["holds"] is None else str(row["holds"]), drift, stray, moved, reach, sparc, share
     return [*(text or "" for text in texts), *numbers, row["verdict"] or row["problem"]]
 
 
