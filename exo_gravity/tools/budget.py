@@ -24,7 +24,7 @@ def _arguments(args: Sequence[str] | None) -> argparse.Namespace:
     parser = argparse.ArgumentParser(prog="budget", description="Torque that a wearer's arm requires of each motor.")
     option = parser.add_argument
     option("--params", required=True, metavar="FILE", help="ROS 2 parameter file with the arms")
-    option("--body-mass", default=0.0, type=float, metavar="KG", help="body mass of the wearer; 0: nobody wears it")
+    option("--body-mass", type=float, metavar="KG", help="of the wearer (default: the file's); 0: nobody wears it")
     option("--sex", default="male", choices=SEX, help="sex of the wearer (%(default)s)")
     option("--table", default="de_leva", choices=tuple(TABLES), help="body segment parameters (%(default)s)")
     option(
@@ -43,24 +43,25 @@ def _arguments(args: Sequence[str] | None) -> argparse.Namespace:
 
 def _run(options: argparse.Namespace) -> int:
     """Draw a figure of each joint, and print the budget of each arm; return 1 if a motor is overloaded somewhere."""
-    mass = options.body_mass
+    configured = configured_arms(options.params)
+    own = max(arm.compensator["wearer.body_mass"] for arm in configured)
+    mass = own if options.body_mass is None else options.body_mass
     wearer = Wearer(mass, options.sex, options.table, options.lengths) if mass else None
     support = one_float("support", options.support if wearer else 0.0, 0.0, 1.0)
     tilt = math.radians(one_float("max_tilt", options.max_tilt, 0.0, 90.0, "deg"))
-    arms = [arm_budget(arm, wearer, support, tilt, options.payload) for arm in configured_arms(options.params)]
+    arms = [arm_budget(arm, wearer, support, tilt, options.payload) for arm in configured]
     folder, written = Path(options.output), []
     folder.mkdir(parents=True, exist_ok=True)
     for arm in arms:
         for joint in range(len(arm.joints)):
             written.append(f"{arm.name.strip('/').replace('/', '_')}_joint_{joint + 1}.png")
-            picture = png_of(joint_figure(arm, joint))
-            (folder / written[-1]).write_bytes(picture)  # at once: Ctrl-C leaves no half of a picture
+            # At once: Ctrl-C leaves no half of a picture.
+            (folder / written[-1]).write_bytes(png_of(joint_figure(arm, joint)))
     if wearer:
         masses = zip(("upper arm", "forearm", "hand"), wearer.segments, strict=True)
         segments = ", ".join(f"{name} {mass:.2f} kg at {cog:.3f} m" for name, (mass, cog) in masses)
         print(f"Wearer: {wearer.body_mass:g} kg, {wearer.sex}, table {wearer.table}: {segments}")
-    zero_g = "Full Zero-G" if support == 1.0 else f"Support {support:g}"
-    carried = f"{zero_g} of a wearer of {mass:g} kg" if wearer else "The arm alone, which nobody wears,"
+    of_wearer = f"{'Full Zero-G' if support == 1.0 else f'Support {support:g}'} of a wearer of {mass:g} kg"
     held = f" with {options.payload:g} kg in the hand" if options.payload else ""
     alike: dict[str, list[ArmBudget]] = {}  # one table names all arms that share it, as mirrored ones do
     for arm in arms:
@@ -68,7 +69,7 @@ def _run(options: argparse.Namespace) -> int:
     for table, (arm, *others) in alike.items():
         names = " and ".join(one.name for one in (arm, *others))
         print(f"\n{names} at support {support:g}, trunk tilt up to {options.max_tilt:g} deg", table, "", sep="\n")
-        print(*verdict(arm, names, f"{carried}{held}"), sep="\n")
+        print(*verdict(arm, names, f"{of_wearer if wearer else 'The arm alone, which nobody wears,'}{held}"), sep="\n")
     print(f"\nWritten: {', '.join(written)} in {folder}")
     return int(any(arm.is_beyond for arm in arms))
 

@@ -131,8 +131,9 @@ def test_full_zero_g_of_75_kg_is_reported_as_beyond_the_papers_motors_and_by_how
     assert ended.code == 1 and "75 kg is beyond the motors of /right" in ended.text
     assert rows_of(ended.text)[1][2:6] == ["AK80-9", "9", "18", "19.63"] and rows_of(ended.text)[1][-1] == "AK80-64"
     assert "within rated torque everywhere is 0.068" in ended.text
-    weak = told("--body-mass", 75, can_bridge={"torque_scale": [1.0, 0.75, 1.0, 1.0]})
-    assert rows_of(weak.text)[1][2:5] == ["AK80-9", "6.75", "13.5"]
+    # The file's own wearer is the default.
+    weak = told(can_bridge={"torque_scale": [1.0, 0.75, 1.0, 1.0]}, compensator={"wearer.body_mass": 75.0})
+    assert rows_of(weak.text)[1][2:6] == ["AK80-9", "6.75", "13.5", "19.63"]
     both = told("--body-mass", 60, file="sim_both.yaml")  # mirrored arms share one table
     assert "/right and /left at support 1" in both.text and len(rows_of(both.text)) == 4
 
