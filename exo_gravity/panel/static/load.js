@@ -50,16 +50,19 @@ export function showLoad(card, compensator, wearer, operates, isCarried) {
   const band = finite(compensator?.["weighed payload band (kg)"]);
   card.weighed = mass;
   card.find(".weigh").disabled = !operates || !isCarried;
-  card.find(".carry").hidden = mass === null || Math.abs(mass - card.payload) < 0.001;
+  const isOld = !isCarried || (mass !== null && Math.abs(mass - card.payload) < 0.001);
+  card.find(".carry").hidden = mass === null || isOld;
   card.find(".carry").disabled = !operates;
   write(card.find(".carry"), mass === null ? "" : t("carry_load", number(mass, 2), number(band, 2)));
   write(card.find(".payload"), t("payload_now", number(card.payload, 2)));
-  write(card.find(".weighing"), weighingText(compensator));
+  write(card.find(".weighing"), weighingText(compensator, isOld));
   write(card.find(".contact"), contactText(card.name, wearer));
 }
 
-function weighingText(compensator) {
+// isOld: whether its result is carried, or of an arm that was let down since.
+function weighingText(compensator, isOld) {
   const phase = compensator?.weighing ?? "none";
+  if (isOld && (phase === "done" || phase === "failed")) return "";
   const trouble = `trouble.${compensator?.["weighing trouble"]}`;
   if (phase === "failed") return t("weighing.failed", has(trouble) ? t(trouble) : compensator["weighing trouble"]);
   if (phase === "done") return t("weighing.done", number(finite(compensator["weighed mass (kg)"]), 2), number(finite(compensator["weighed band (kg)"]), 2));
