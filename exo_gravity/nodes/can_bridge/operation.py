@@ -132,7 +132,7 @@ class BridgeServices:
             safety.disable(time.monotonic())
         elif not safety.enable(time.monotonic()):
             reason = f" ({safety.fault.reason})" if safety.fault else ""
-            return f"refused: the arm is {safety.state.value}{reason}"
+            return f"refused: the arm's state is {safety.state.value}{reason}"
         return ""
 
     def clear_fault(self, loop: ControlLoop, _request: Trigger.Request) -> str:
