@@ -5,16 +5,16 @@ The commanded effort that holds the arm in a pose is, without friction, which av
 
     effort = (torque(moments + load) + spring theta) / scale + offset
 
-where torque is the arm's regressor (moment_model.py) times its moments. A spring across a joint is identified only
-where the poses ask for it (`pose_fit.asked_for`), and a slope of its scale over the motor's temperature where the arm
-was seen cold and warm.
+where torque is the arm's regressor (moment_model.py) times its moments; `solve` fits all of it at once. A spring across
+a joint stays where it stands out of its error, and a slope of its scale over the motor's temperature where the arm was
+seen cold and warm.
 
 The places of the joints are unknowns, too, as small turns: about a joint's axis, which is an error of its encoder's
 zero, and across it, which is an axis askew. A turn shows where the joints beyond turn about another axis. The zero of
 the last joint does not, nor that of one whose next axis is parallel: they look like a moment across the link. A turn of
-the first joint is one of the whole arm: with an IMU it is part of its mounting. What does not show stays within its
-prior. A parameter file takes over the zeros, and the axes of an arm from a URDF; the closed forms of the paper's arm
-have fixed axes. `held` finds the moments that make up for what a file does not take over, and what that may cost.
+the first joint is one of the whole arm: with an IMU it is part of its mounting. A parameter file takes over the zeros,
+and the axes of an arm from a URDF; the closed forms of the paper's arm have fixed axes. `held` finds the moments that
+make up for what a file does not take over, and what that may cost.
 
 A pose that does not fit the others (a hand on the arm, a slipping joint) is left out. A result that no arm can have is
 refused, with the pose that is missing. Held poses do not show a common factor of all scales and moments without a known
@@ -42,18 +42,16 @@ from exo_gravity.lab.calibration.held import held
 from exo_gravity.lab.calibration.moment_model import TURNS, MomentModel
 from exo_gravity.lab.calibration.pose_fit import (
     DISTURBED,
+    EXACT,
     FIT,
     FitLayout,
     Places,
-    asked_for,
-    bounded,
-    final,
+    columns,
+    known_of,
     layout_of,
-    possible_extras,
-    robust,
-    rows_of,
+    rows_at,
+    solve,
     temperatures,
-    without_each_pose,
     without_outliers,
 )
 from exo_gravity.lab.calibration.poses import missing_pose, shown_by
@@ -105,8 +103,7 @@ class Identified:
     offset: np.ndarray  #: (n,) Nm as commanded
     friction: np.ndarray  #: (n,) Nm as commanded
     residual: np.ndarray  #: (m, n) Nm, effort minus prediction
-    held_out: np.ndarray  #: (m, n) Nm, the same predicted without that pose, NaN where the others do not suffice
-    singular_values: np.ndarray  #: of the information in the poses, the largest first; below 1: not known
+    held_out: np.ndarray  #: (m, n) Nm, the same predicted without that pose
     unknown: tuple[str, ...]  #: sentences on what the poses do not show, and what would
     rejected: tuple[tuple[int, str], ...]  #: index and reason of each observation that is not used
     #: No weight was hung: the product of the compared scales is taken as 1, moments are in commanded torque.
@@ -136,62 +133,69 @@ def identify(observations: Sequence[Observation], model: MomentModel, places: Pl
 
     Raises DataError if the result would be unphysical, naming the missing pose, and if an observation is impossible.
     """
-    at, plain = layout_of(model), rows_of(observations, model, places or Places())
-    extras = asked_for(plain, possible_extras(plain), robust)
+    at, (theta, down, effort, spread) = layout_of(model), columns(observations)
+    weights = [(one.load_mass, one.load_lever) for one in observations]
+    load, beside = (np.array([of(*weight) for weight in weights]) for of in (model.load, model.load_beside))
+    temperature, is_relative = temperatures(observations), not np.any(load)
+    warmth = np.nan_to_num(temperature - temperature.mean(axis=0))
+    rows = rows_at(model, theta, down, model.turned(theta))._replace(warmth=warmth, load=load, beside=beside)
+    known = known_of(model, places or Places(), is_relative)
+    known.error[at.slope][np.ptp(warmth, axis=0) < FIT.least_warming] = EXACT
+    spread = np.hypot(spread, FIT.least_spread)
+    keep, rejected = without_outliers(rows, known, effort, spread)
+    used, seen, spread = rows.only(keep), effort[keep], spread[keep]
     while True:
-        rows = plain.with_extras(extras)
-        # With few poses, zeros and axes that are free could explain that one of them was touched.
-        keep, rejected = without_outliers(rows if model.is_described else rows.holding(range(at.turn.start, at.count)))
-        fewer = asked_for(plain.only(keep), extras, final)  # an outlier may have looked like a spring
-        if fewer == extras:
+        solution = solve(used, known, seen, spread)
+        size = solution.unknowns[at.spring] / solution.error[at.spring]
+        size[known.error[at.spring] <= EXACT] = np.inf
+        if size.min() > FIT.asked:
             break
-        extras = fewer
-    used, solution = bounded(rows.only(keep), model.at_least_0)
-    typical, peak = np.median(np.abs(solution.residual), axis=0), np.abs(used.effort).max(axis=0)
+        known.error[at.spring][np.argmin(size)] = EXACT  # the others may now stand out
+    typical, peak = np.median(np.abs(solution.residual), axis=0), np.abs(seen).max(axis=0)
     for joint in np.flatnonzero(typical > np.maximum(ACCEPTED.misfit * peak, ACCEPTED.least_misfit)):
         misfit = f"joint {joint + 1} is {typical[joint]:.2f} Nm off in half of the poses"
         raise DataError(f"the poses do not fit one arm: {misfit}. {DISTURBED}")
-    direction, is_relative = observations[-1].direction, not np.any(used.load)
-    hidden = solution.hidden > FIT.hidden
-    _check_known(hidden, len(observations), direction, model, is_relative)
-    unknowns = np.where(hidden, rows.start, solution.unknowns)
-    unknowns[[index for index in at.extras if index not in extras]] = 0.0  # exactly
+    joints = model.compared
+    unseen = FIT.common * known.error[at.scale][joints] / math.sqrt(max(1, len(joints)))
+    if not is_relative and np.all(solution.error[at.scale][joints] > unseen):
+        raise DataError("the weight shows no common factor: hang a heavier one, or hold it with a horizontal forearm")
+    _check_known(solution.hidden, len(observations), down[-1], model)
     # Student's distribution: for few poses two standard errors would cover less than 95 %.
-    covariance = solution.covariance * (1.0 + 1.25 / (solution.freedom.min() + 6.0)) ** 2
-    error = np.where(hidden, np.inf, np.sqrt(np.diag(covariance)))
+    solution = solution._replace(covariance=solution.covariance * (1.0 + 1.25 / (solution.freedom.min() + 6.0)) ** 2)
+    unknowns, error = solution.unknowns, solution.error
     moments, scale = unknowns[at.moment], np.exp(unknowns[at.scale])
-    check_physical(moments, error[at.moment], scale, direction, model)
+    check_physical(moments, error[at.moment], scale, down[-1], model)
     _check_joints(unknowns, at)
     stiffness, slope = unknowns[at.spring], unknowns[at.slope]
     slack = -unknowns[at.offset] * scale / np.where(stiffness > 0.0, stiffness, np.inf)
-    residual = rows.effort - rows.predicted(solution.unknowns)
-    beyond_noise = np.maximum(used.sigma**2 - rows.only(keep).sigma ** 2, 0.0)
-    misfit = np.sqrt(beyond_noise.mean(axis=0))
-    file = held(model, used, unknowns, covariance, ~hidden[at.moment], misfit)
+    beyond_noise = np.maximum(solution.sigma**2 - spread**2, 0.0)
+    friction = np.array([observation.friction for observation in observations])
+    carried = np.abs(effort) - np.abs(effort).mean(axis=0)
+    grows = np.maximum((carried * friction).sum(axis=0) / np.maximum((carried**2).sum(axis=0), 1e-12), 0.0)
+    file = held(model, solution, np.sqrt(beyond_noise.mean(axis=0)), grows)
+    residual = effort - rows.predicted(unknowns)
     held_out = residual.copy()
-    held_out[keep], _ = without_each_pose(solution, used.sigma)
-    friction = np.median([observation.friction for observation in observations], axis=0)
+    held_out[keep] = solution.held_out
     return Identified(
-        moments, error[at.moment], scale, scale * error[at.scale], unknowns[at.offset], friction, residual, held_out,
-        solution.singular_values, tuple(_unknown(unknowns, hidden, is_relative, model)), rejected,
-        is_relative, unknowns[at.tilt], covariance[at.tilt, at.tilt], stiffness,
+        moments, error[at.moment], scale, scale * error[at.scale], unknowns[at.offset],
+        np.median(friction, axis=0), residual, held_out,
+        tuple(_unknown(unknowns, solution.hidden, is_relative, model)), rejected,
+        is_relative, unknowns[at.tilt], solution.covariance[at.tilt, at.tilt], stiffness,
         error[at.spring] * (stiffness > 0.0), np.clip(slack, -MAX_REST, MAX_REST), slope,
         error[at.slope] * (slope != 0.0),
-        temperatures(observations).mean(axis=0),
+        temperature.mean(axis=0),
         unknowns[at.turn].reshape(-1, TURNS), error[at.turn].reshape(-1, TURNS),
-        file.unknowns[at.moment], rows.effort - rows.predicted(file.unknowns), file.error,
+        file.unknowns[at.moment], effort - rows.predicted(file.unknowns), file.error,
     )  # fmt: skip
 
 
-def _check_known(hidden: np.ndarray, count: int, direction: Vector, model: MomentModel, is_relative: bool) -> None:
+def _check_known(hidden: np.ndarray, count: int, direction: Vector, model: MomentModel) -> None:
     """Raise DataError that names what is missing if `count` poses do not show `hidden` (count,) that others would."""
     at = layout_of(model)
     missing = hidden & shown_by(model, model.suggested, direction)
     shown = model.upright  # what shows while the base leans needs no pose
-    needed = np.concatenate((shown.any(axis=0), *(shown.any(axis=1),) * 2, np.ones(at.count - at.angle.start, bool)))
+    needed = np.concatenate((shown.any(axis=0), *(shown.any(axis=1),) * 2, np.ones(at.total - at.angle.start, bool)))
     missing &= needed
-    if np.all(missing[at.scale][model.compared]) and not is_relative:
-        raise DataError("the weight shows no common factor: hang a heavier one, or hold it with a horizontal forearm")
     if np.any(missing):
         names = ", ".join(name for name, is_missing in zip(_names(model), missing, strict=False) if is_missing)
         pose = missing_pose(missing, direction, model)
@@ -229,7 +233,7 @@ def check_physical(
     for index in model.above_0:
         moment, uncertain = f"{model.names[index]} = {moments[index]:.3f} kg m", error[index]
         if uncertain > abs(moments[index]):
-            pose = missing_pose(np.arange(layout_of(model).count) == index, direction, model)
+            pose = missing_pose(np.arange(layout_of(model).total) == index, direction, model)
             raise DataError(f"{moment} is not known better than {uncertain:.3f}: add the pose {pose}")
         if moments[index] <= 0.0:
             raise DataError(f"{moment}: must be positive: check direction and zero of joint {index + 1}")

@@ -18,7 +18,7 @@ from exo_gravity.core.errors import DataError
 from exo_gravity.core.numbers import Torque, Vector
 from exo_gravity.core.safety.limits import WALL, Limits
 from exo_gravity.lab.calibration.moment_model import MomentModel
-from exo_gravity.lab.calibration.pose_fit import layout_of, unmeasured
+from exo_gravity.lab.calibration.pose_fit import FIT, FitLayout, layout_of, rows_at
 from exo_gravity.lab.calibration.tracking import MOTION, Line, Observation, Station
 
 
@@ -26,8 +26,6 @@ from exo_gravity.lab.calibration.tracking import MOTION, Line, Observation, Stat
 class Prior:
     """How unsure the torque is that holds the arm, before a pose is measured."""
 
-    share: float = 0.4  #: of a moment: masses and torque scales that are each off by 30 %
-    moment: float = 0.02  #: kg m, in addition: off-axis moments of which the file knows nothing
     load_share: float = 0.2  #: of the torque of a known weight, as commanded: torque scales that are off by 30 %
     offset: float = 0.05  #: Nm, of a motor, or where a cable is slack
     spring: float = 0.09  #: Nm/rad: cables of up to 0.15
@@ -54,6 +52,8 @@ class PoseChoice:
     first_edge: float = 0.1  #: rad in addition, at the first pose
     edge: float = 0.02  #: rad between a sweep's end and the soft wall
     time_share: float = 1.5  #: of the time left for each pose, that the next one may take
+    moment: float = 0.1  #: kg m, standard error of any moment before,
+    other: float = 0.3  #: and of other unknowns, in their units
     noise: float = 0.03  #: Nm in any pose
     noise_share: float = 0.02  #: of the torque
     shown: float = 0.03  #: of what noise hides, from which the poses together show an unknown
@@ -86,7 +86,7 @@ class TorqueGuess:
 
     def __init__(self, model: MomentModel, moments: Vector, tilt: Tilt) -> None:
         moments = np.asarray(moments, dtype=float)
-        deviation = np.append(PRIOR.share * np.abs(moments) + PRIOR.moment, (PRIOR.offset, PRIOR.spring))
+        deviation = np.append(FIT.share * np.abs(moments) + FIT.moment, (PRIOR.offset, PRIOR.spring))
         self.model = model
         self.tilt = tilt
         self._mean = np.tile(np.append(moments, (0.0, 0.0)), (model.count, 1))  # of each joint: moments, offset, spring
@@ -311,9 +311,9 @@ def next_pose(
     direction: (3,), gravity's unit vector in the base frame.
     moments: (k,) kg m, a guess.
     """
-    at = layout_of(model)
-    seen = _sensitivity(np.reshape(taken, (-1, model.count)), direction, moments, model).reshape(-1, at.count)
-    information = np.diag(at.natural**-2.0) + seen.T @ seen
+    known = _before(layout_of(model))
+    seen = _sensitivity(np.reshape(taken, (-1, model.count)), direction, moments, model).reshape(-1, len(known))
+    information = np.diag(known**-2.0) + seen.T @ seen
     rows = _sensitivity(candidates, direction, moments, model)
     added = np.eye(model.count) + rows @ np.linalg.inv(information) @ rows.transpose(0, 2, 1)
     return int(np.argmax(np.linalg.slogdet(added)[1].round(6)))
@@ -322,21 +322,29 @@ def next_pose(
 def missing_pose(hidden: np.ndarray, direction: Vector, model: MomentModel) -> str:
     """Return, in words, the suggested pose that shows most of the unknowns of which `hidden` (count,) are not known."""
     poses = model.suggested
-    shown = _sensitivity(poses, direction, model.moments, model) * layout_of(model).natural * hidden
+    shown = _sensitivity(poses, direction, model.moments, model) * _before(layout_of(model)) * hidden
     best = poses[int(np.argmax((shown**2).sum(axis=(1, 2))))]
     return f"[{', '.join(f'{math.degrees(angle):.0f}' for angle in best)}] degrees"
 
 
 def shown_by(model: MomentModel, poses: np.ndarray, direction: Vector) -> np.ndarray:
     """Return which of the unknowns (count,) `poses` (m, n) rad could show."""
-    shown = _sensitivity(poses, direction, model.moments, model) * layout_of(model).natural
+    shown = _sensitivity(poses, direction, model.moments, model) * _before(layout_of(model))
     return np.asarray(np.sqrt((shown**2).sum(axis=(0, 1))) > CHOICE.shown * math.sqrt(len(poses)))
+
+
+def _before(at: FitLayout) -> np.ndarray:
+    """Return the standard errors (count,) of the unknowns before a pose is chosen, the same for each arm."""
+    error = np.full(at.total, CHOICE.other)
+    error[at.moment] = CHOICE.moment
+    return error
 
 
 def _sensitivity(theta: np.ndarray, direction: Vector, moments: Vector, model: MomentModel) -> np.ndarray:
     """Return the derivative of the efforts in the poses (m, n) by the unknowns, by their noise: (m, n, count)."""
     at = layout_of(model)
-    unknowns = at.start(np.asarray(moments))
-    rows = unmeasured(model, theta, np.broadcast_to(direction, (len(theta), 3)), unknowns)
+    unknowns = np.append(moments, np.zeros(at.total - len(model.names)))
+    turned = np.zeros((len(theta), model.count, len(model.names), 3, at.turn.stop - at.turn.start))
+    rows = rows_at(model, theta, np.broadcast_to(direction, (len(theta), 3)), turned)
     noise = np.hypot(CHOICE.noise, CHOICE.noise_share * rows.predicted(unknowns))
-    return np.asarray(rows.jacobian(unknowns) / noise[..., None] * (np.arange(at.count) < at.tilt.start))
+    return np.asarray(rows.jacobian(unknowns) / noise[..., None] * (np.arange(at.total) < at.tilt.start))

@@ -210,8 +210,7 @@ def _sections(result: CalibrationResult) -> Iterator[str]:
         caption = f"{line}. What remains in each pose: inside the band, friction holds the arm; outside, it creeps."
         yield html.picture(html.png_of(torque_figure(found, *of), DPI), caption)
         yield html.bullets("Drift to expect", _drift(found, *remainders(found, *of)))
-        values = " ".join(f"{value:.3g}" for value in found.singular_values)
-        yield html.bullets("What these poses do not show", [*unknown, f"Singular values of the information: {values}"])
+        yield html.bullets("What these poses do not show", unknown)
     if result.curves and result.arm:
         caption = "Friction over speed, half the difference between both directions."
         yield html.picture(html.png_of(friction_figure(result.curves, result.arm.joint_names), DPI), caption)

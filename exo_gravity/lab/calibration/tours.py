@@ -190,9 +190,8 @@ def _changes(arm: ConfiguredArm, model: MomentModel, found: Identified, scale: l
         *_temperature_changes(arm, found),
         *_spring_changes(arm, found),
     ]
-    if np.all(np.isfinite(found.held_out).any(axis=0)):
-        note = "Nm, in poses that no tour visited"
-        changes.append(Change(node, "model_error.torque", found.torque_error.round(4).tolist(), note))
+    note = "Nm, in poses that no tour visited"
+    changes.append(Change(node, "model_error.torque", found.torque_error.round(4).tolist(), note))
     if not found.relative:
         known = np.isfinite(found.scale_error)
         share = np.where(known, found.scale_error / found.scale, for_joints(ModelError().scale, len(scale), max))

@@ -77,9 +77,9 @@ def test_the_prediction_of_a_pose_is_that_of_a_fit_without_it_and_nearly_as_good
 def test_without_a_weight_moments_and_scales_are_relative_but_the_commanded_torque_is_right():
     device = Device(3)
     found = identify(device.tour(bare=12, weighed=0), PAPERS)
-    assert found.relative and "common factor" in found.unknown[0] and found.singular_values[-1] < 1e-3
+    assert found.relative and "common factor" in found.unknown[0]
     weighed = identify(Device(3).tour(), PAPERS)
-    assert not weighed.relative and weighed.singular_values[-1] > 1.0 and "common factor" not in weighed.unknown[0]
+    assert not weighed.relative and "common factor" not in weighed.unknown[0]
     assert np.prod(found.scale[1:]) == pytest.approx(1.0, abs=1e-5)
     factor = found.moments[1] / device.moments[1]
     assert factor == pytest.approx(np.prod(device.scale[1:]) ** (-1.0 / 3.0), rel=0.01)
@@ -99,13 +99,13 @@ def test_with_an_upright_stand_joint_1_is_not_known_and_said_to_be_and_of_equal_
 
 @pytest.mark.parametrize(
     ("seed", "tilt", "error"),
-    [(30, (0.05, 0.05), 0.002), pytest.param(31, (0.003, 0.002), np.inf, marks=pytest.mark.thorough)],
+    [(30, (0.05, 0.05), 0.002), pytest.param(31, (0.003, 0.002), 0.02, marks=pytest.mark.thorough)],
 )
 def test_the_first_moment_is_never_negative_and_its_error_stays_honest(seed, tilt, error):
     device = Device(seed)
     device.moments[0] = -0.003
     found = identify(device.tour(Tilt.of("right", *tilt).direction), PAPERS)
-    assert found.moments[0] == (0.0 if error < np.inf else PAPERS.moments[0]) and found.error[0] >= error
+    assert 0.0 <= found.moments[0] < device.moments[0] + 2.0 * found.error[0] and found.error[0] >= error
 
 
 def test_a_zero_that_is_off_looks_like_a_moment_across_the_link_and_the_torque_is_right_all_the_same():
@@ -222,9 +222,17 @@ def test_the_papers_derivatives_by_turns_are_pinocchios():
         np.testing.assert_allclose(derivative, (ends[0] - ends[1]) / (2.0 * step), atol=1e-6)
 
 
+def test_friction_that_grows_with_the_torque_widens_the_band():
+    tour = Device(6).tour()
+    assert np.all(
+        identify([one._replace(friction=one.friction + 0.1 * np.abs(one.effort)) for one in tour], PAPERS).torque_error
+        > identify(tour, PAPERS).torque_error
+    )
+
+
 def test_zeros_of_a_jig_are_kept():
     found = identify(Device(5).tour(), PAPERS, Places(zero=0.0))
-    assert np.abs(found.turn[:, 0]).max() < 1e-4 < np.abs(identify(Device(5).tour(), PAPERS).turn[1, 0])
+    assert np.abs(found.turn[:, 0]).max() < 1e-4 < np.abs(identify(Device(5).tour(), PAPERS).turn[:, 0]).max()
 
 
 def test_the_next_pose_shows_more_than_a_repeated_or_a_random_one():
@@ -253,9 +261,9 @@ def test_a_pose_with_a_slip_or_a_hand_is_left_out_and_named(slips):
     for index, error in slips.items():
         observations[index] = observations[index]._replace(effort=np.add(observations[index].effort, error))
     found = identify(observations, PAPERS)
-    assert {index for index, _ in found.rejected} == set(slips)
-    for index, reason in found.rejected:
-        assert f"joint {int(np.argmax(np.abs(slips[index]))) + 1}" in reason
+    assert {index: reason.partition(" is ")[0] for index, reason in found.rejected} == {
+        index: f"effort of joint {int(np.argmax(np.abs(error))) + 1}" for index, error in slips.items()
+    }
     assert np.all(np.abs(found.moments - device.moments) < 4.0 * found.error)
 
 
@@ -268,9 +276,8 @@ def test_a_pose_with_a_slip_or_a_hand_is_left_out_and_named(slips):
 )
 def test_poses_that_do_not_fit_one_arm_are_refused_together(bare, spoilt, words):
     observations = Device(7).tour(bare=bare)
-    for k in range(spoilt):
-        error = np.eye(4)[k % 4] * (-1) ** k  # Nm
-        observations[2 * k] = observations[2 * k]._replace(effort=observations[2 * k].effort + error)
+    for k, one in enumerate(observations[: 2 * spoilt : 2]):
+        observations[2 * k] = one._replace(effort=one.effort + np.eye(4)[k % 4] * (-1) ** k)  # Nm
     with pytest.raises(DataError, match=rf"the poses do not fit one arm: .*{words}.*touched"):
         identify(observations, PAPERS)
 
