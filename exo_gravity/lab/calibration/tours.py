@@ -215,7 +215,11 @@ def _zero_changes(arm: ConfiguredArm, found: Identified) -> Iterator[Change]:
         return
     bridge, (degrees, error) = arm.can_bridge, np.degrees((found.turn[:, 0], found.turn_error[:, 0]))
     zero = np.array(bridge["zero"]) - np.array(bridge["direction"]) * found.turn[:, 0]
-    note = f"rad; the joints are {row(degrees)} degrees farther than the file said, +-{row(error)}"
+    # A zero that no pose shows is kept, with next to no error of its own.
+    note = (
+        f"rad; the joints are {row(degrees)} degrees farther than the file said, "
+        f"+-{row(np.where(error > 1e-3, error, np.nan))} degrees"
+    )
     yield Change(f"{arm.namespace}/can_bridge", "zero", (zero.round(5) + 0.0).tolist(), note)
 
 
@@ -259,7 +263,7 @@ def _lines(arm: ConfiguredArm, found: Identified) -> Iterator[str]:
     yield f"largest torque error of a pose that was left out: {worst:.3f} Nm"
     for index, reason in found.rejected:
         yield f"pose {index + 1} was not used: {reason}"
-    yield from found.unknown
+    yield from (f"Not shown by these poses: {what}" for what in found.unknown)
 
 
 def row(values: np.ndarray) -> str:
