@@ -157,7 +157,7 @@ def test_while_the_trunk_turns_and_the_joints_move_the_torque_is_one_that_a_tilt
 def is_untouched(carried, pressed=(0.0, 0.0, 0.0), lacking=(0.0, 0.0, 0.0), every=1):
     """Return what is seen of a robot whose motors carry more than itself, while something presses on its joints, Nm.
 
-    every: cycles from one in which it does to the next.
+    every: it presses in one of so many cycles.
     """
     watch, momentum = TouchWatch(), np.zeros(3)
     for n in range(round(4.0 * TOUCH.time / 0.004)):

@@ -91,7 +91,7 @@ Maker = Callable[[LawData], Law]
 class Laws(dict[str, Maker]):
     """What makes each law, by name. Raises ParameterError where the law does not cover such an arm."""
 
-    by_moments = ("exact", URDF_LAW)  #: which need neither masses nor centres of gravity
+    by_moments = ("exact", URDF_LAW)  #: laws that need neither masses nor centres of gravity
 
     def __missing__(self, name: str) -> Maker:
         """Return what makes the law `name` of another distribution. Raises KeyError, ParameterError."""

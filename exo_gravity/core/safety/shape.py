@@ -155,7 +155,7 @@ class JointShaper:
         self._slowly = rate_limited(slow, self._slowly, DAMPING_RATE * dt)
         self._last = cause if slow else self._last
         acting = {
-            "soft wall": wall > 0.5 * DAMPING,  # nobody feels less; an arm may hang just inside
+            "soft wall": wall > 0.5 * DAMPING,  # less is not felt, and an arm may hang just inside
             "derating": permitted < limit,
             "max_effort": clamped != wanted,
             "max_effort_rate": given != clamped,

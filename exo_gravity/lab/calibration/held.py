@@ -9,11 +9,11 @@ variance J C J^T and the part of the residuals that their stated noise does not 
 is much the same in many poses. So the band is that which contains 95 % of all errors in all poses, and not a multiple
 of their root mean square, which would contain more.
 
-No pose shows that friction differs between both directions, whose mean counts as gravity's torque. A gear that loses
+No pose shows that friction differs between the two directions, whose mean counts as gravity's torque. A gear that loses
 more while it drives its load than while it is driven makes a share of that torque look like more torque or less. How
 friction grows with the torque is measured; `UNEQUAL` of it, as a standard error, is in the band. It was chosen on 28
 devices of another make (3, 4 and 7 joints), where 95 % bands contained 74 to 100 % by joint, and without it 62 to
-100 %. On 28 other ones they contained 86 to 100 %, and without it 70 to 99 %. Unequal Coulomb friction shows as an
+100 %. On 28 others they contained 86 to 100 %, and without it 70 to 99 %. Unequal Coulomb friction shows as an
 offset.
 
 A common factor of moments and torque scales is in C, however large, and cancels in J: it holds the arm all the same.

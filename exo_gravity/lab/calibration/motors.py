@@ -30,7 +30,7 @@ Clock = Callable[[], float]
 Wait = Callable[[str, Callable[[], Table]], None]
 """(request, watch): shows the request and calls watch() for the table to show, until the person has done it."""
 
-# Where the trunk's axes x, y and z lead, and from where somebody looks who sees them point at themselves.
+# Of the trunk's axes x, y and z: where a motion along -axis or +axis goes, and from where -axis or +axis points at one.
 TOWARDS = (("back", "to the front"), ("to the right", "to the left"), ("down", "up"))
 SEEN = (("from behind", "from the front"), ("from the right", "from the left"), ("from below", "from above"))
 UNCHECKED = "not checked after a power-up"

@@ -10,8 +10,9 @@ small turns of the joints' places. The commanded effort is `torque(moments + loa
 Each unknown is known before, with a standard error: the moments as the file has them, the others as 0. What the poses
 do not show of it stays within that, and is part of the errors.
 
-A pose that somebody touched is found by a fit in which a residual counts the less the larger it is, and is left out of
-the plain one. Errors are larger in some joints than the observations state (gear friction is not the same in every
+A first fit, in which large residuals weigh less, finds the poses that somebody touched. The plain fit leaves them out.
+
+Errors are larger in some joints than the observations state (gear friction is not the same in every
 pose), so each joint gets a factor of its own, estimated from its residuals and pooled with the others where poses are
 few.
 """
@@ -39,7 +40,7 @@ class Fit:
     scale: float = 0.3  #: of a torque scale,
     described_scale: float = 0.15  #: and of an arm whose masses are known; users report 0.75
     offset: float = 0.3  #: Nm
-    beside: float = 0.05  #: rad, of a weight's place; 3 degrees
+    beside: float = 0.05  #: rad, by which a known weight may lie beside its link; 3 degrees
     #: rad about each axis, of gravity's measured direction: an IMU's mounting, mostly its heading
     tilt: float = 0.05
     spring: float = 0.09  #: Nm/rad: cables of up to 0.15
@@ -114,7 +115,7 @@ class Known(NamedTuple):
 
 def known_of(model: MomentModel, places: Places, is_relative: bool) -> Known:
     """Return what is known of an arm; is_relative: without a weight a common factor does not show, which is then 1."""
-    at, unit = layout_of(model), np.eye(layout_of(model).total)
+    at = layout_of(model)
     start, least, error = np.zeros(at.total), np.full(at.total, -np.inf), np.zeros(at.total)
     start[at.moment] = model.moments
     least[at.spring] = least[list(model.at_least_0)] = 0.0
@@ -126,7 +127,7 @@ def known_of(model: MomentModel, places: Places, is_relative: bool) -> Known:
     error[at.turn] = np.resize((places.zero, places.axis, places.axis), TURNS * model.count)
     if model.shows_tilt:
         error[at.turn][:TURNS] = 0.0  # the whole arm turns with its first joint, which is the same as gravity turned
-    product = unit[at.scale][model.compared].sum(axis=0, keepdims=True) * is_relative
+    product = np.eye(at.total)[at.scale][model.compared].sum(axis=0, keepdims=True) * is_relative
     return Known(start, np.maximum(error, EXACT), least, product / EXACT)
 
 

@@ -18,7 +18,7 @@ from exo_gravity.core.errors import DataError
 from exo_gravity.core.numbers import Torque, Vector
 from exo_gravity.core.safety.limits import WALL, Limits
 from exo_gravity.lab.calibration.moment_model import MomentModel
-from exo_gravity.lab.calibration.pose_fit import FIT, FitLayout, layout_of, rows_at
+from exo_gravity.lab.calibration.pose_fit import FIT, layout_of, rows_at
 from exo_gravity.lab.calibration.tracking import MOTION, Line, Observation, Station
 
 
@@ -28,7 +28,6 @@ class Prior:
 
     load_share: float = 0.2  #: of the torque of a known weight, as commanded: torque scales that are off by 30 %
     offset: float = 0.05  #: Nm, of a motor, or where a cable is slack
-    spring: float = 0.09  #: Nm/rad: cables of up to 0.15
     unexplained: float = 0.05  #: Nm: standard deviation of what none of these explains,
     angle: float = 0.03  #: rad, and of the direction in which it pulls: zeros and axes that are off
     #: of a joint: 30 % off in mass, centre of gravity and torque scale are 0.38 to 2.4 in one link, less in a whole arm
@@ -86,7 +85,7 @@ class TorqueGuess:
 
     def __init__(self, model: MomentModel, moments: Vector, tilt: Tilt) -> None:
         moments = np.asarray(moments, dtype=float)
-        deviation = np.append(FIT.share * np.abs(moments) + FIT.moment, (PRIOR.offset, PRIOR.spring))
+        deviation = np.append(FIT.share * np.abs(moments) + FIT.moment, (PRIOR.offset, FIT.spring))
         self.model = model
         self.tilt = tilt
         self._mean = np.tile(np.append(moments, (0.0, 0.0)), (model.count, 1))  # of each joint: moments, offset, spring
@@ -311,7 +310,7 @@ def next_pose(
     direction: (3,), gravity's unit vector in the base frame.
     moments: (k,) kg m, a guess.
     """
-    known = _before(layout_of(model))
+    known = _before(model)
     seen = _sensitivity(np.reshape(taken, (-1, model.count)), direction, moments, model).reshape(-1, len(known))
     information = np.diag(known**-2.0) + seen.T @ seen
     rows = _sensitivity(candidates, direction, moments, model)
@@ -322,21 +321,21 @@ def next_pose(
 def missing_pose(hidden: np.ndarray, direction: Vector, model: MomentModel) -> str:
     """Return, in words, the suggested pose that shows most of the unknowns of which `hidden` (count,) are not known."""
     poses = model.suggested
-    shown = _sensitivity(poses, direction, model.moments, model) * _before(layout_of(model)) * hidden
+    shown = _sensitivity(poses, direction, model.moments, model) * _before(model) * hidden
     best = poses[int(np.argmax((shown**2).sum(axis=(1, 2))))]
     return f"[{', '.join(f'{math.degrees(angle):.0f}' for angle in best)}] degrees"
 
 
 def shown_by(model: MomentModel, poses: np.ndarray, direction: Vector) -> np.ndarray:
     """Return which of the unknowns (count,) `poses` (m, n) rad could show."""
-    shown = _sensitivity(poses, direction, model.moments, model) * _before(layout_of(model))
+    shown = _sensitivity(poses, direction, model.moments, model) * _before(model)
     return np.asarray(np.sqrt((shown**2).sum(axis=(0, 1))) > CHOICE.shown * math.sqrt(len(poses)))
 
 
-def _before(at: FitLayout) -> np.ndarray:
-    """Return the standard errors (count,) of the unknowns before a pose is chosen, the same for each arm."""
-    error = np.full(at.total, CHOICE.other)
-    error[at.moment] = CHOICE.moment
+def _before(model: MomentModel) -> np.ndarray:
+    """Return the standard errors (count,) of an arm's unknowns before a pose is chosen."""
+    error = np.full(layout_of(model).total, CHOICE.other)
+    error[: len(model.names)] = CHOICE.moment
     return error
 
 

@@ -215,7 +215,7 @@ def _zero_changes(arm: ConfiguredArm, found: Identified) -> Iterator[Change]:
         return
     bridge, (degrees, error) = arm.can_bridge, np.degrees((found.turn[:, 0], found.turn_error[:, 0]))
     zero = np.array(bridge["zero"]) - np.array(bridge["direction"]) * found.turn[:, 0]
-    # A zero that no pose shows is kept, with next to no error of its own.
+    # A zero that no pose shows keeps the value of the file, and its error means nothing.
     note = (
         f"rad; the joints are {row(degrees)} degrees farther than the file said, "
         f"+-{row(np.where(error > 1e-3, error, np.nan))} degrees"

@@ -96,10 +96,10 @@ class TrialScreen:
         self.status = content.pop("status", {})
         self.faults = content.pop("faults", [])
         self._arms = {name: arm for name, arm in content.items() if "position" in arm}
-        new = [fault for fault in self.faults if fault not in self._told]
-        for fault in new if self.guided and self._start == math.inf else ():
-            self._told.append(fault)
-            self.console.print(f"until the arm is carried: {fault}", markup=False, soft_wrap=True)
+        if self.guided and self._start == math.inf:
+            for fault in (fault for fault in self.faults if fault not in self._told):
+                self._told.append(fault)
+                self.console.print(f"until the arm is carried: {fault}", markup=False, soft_wrap=True)
         if not self._ending:
             self._follow([arm["step"]["step"] for arm in content.values() if "step" in arm])
             if self._start < math.inf:
