@@ -2,8 +2,9 @@
 """The timing of a loop from the frames on its bus: latency from reply to torque, cycle spacing, missed cycles.
 
 The content of a command shows which replies it answers. The arm moves to and fro, so that its angles change by a few
-position codes each cycle. The angles of a cycle determine, by the law under test, the command frames that answer it,
-bit for bit: while the arm is carried within its limits on an upright trunk, the loop changes nothing else.
+position codes each cycle. The angles of a cycle determine, by the law under test, the torques that answer it, and with
+the damping of a command its frame, bit for bit: while the arm is carried within its limits on an upright trunk, the
+loop changes no torque.
 An answer that equals one of the last cycles' is left out: the arm turned too little to distinguish them. Every other
 answer is searched in the later cycles; where a newer answer overtook it, that one counts. The latency of each motor
 runs from its reply to its command.
@@ -23,6 +24,7 @@ GIVE_UP = 0.1  # s after which an answer is treated as lost
 
 Law = Callable[[Sequence[float]], Sequence[float]]
 Answer = tuple[bytes, ...]  # the command frames to all motors
+Commands = Callable[[Sequence[float]], Answer]  # damping of each joint in Nm s/rad -> the commands with it
 
 
 @dataclass(frozen=True)
@@ -78,18 +80,19 @@ def analyse(cycles: Sequence[Cycle], motors: Sequence[JointMotor], law: Law, per
     starts = np.array([cycle.commands[0][0] for cycle in cycles])
     spacing = np.diff(starts)
     cycles_due = round(float(starts[-1] - starts[0]) / period) + 1
-    answers = [_expected_answer(cycle, motors, law) for cycle in cycles]
+    expected = [_expected_commands(cycle, motors, law) for cycle in cycles]
+    answers = [commands and commands([0.0] * len(motors)) for commands in expected]
     sent = [_sent_answer(cycle, len(motors)) for cycle in cycles]
     latency: list[float] = []
     lost = 0
     for k, answer in enumerate(answers):
         if k < DISTINCT or answer is None or answer in answers[k - DISTINCT : k] or starts[-1] - starts[k] < GIVE_UP:
             continue
-        n = _first_answer(k, answers, sent, starts)
+        n = _first_answer(k, expected, sent, motors, starts)
         if n is None:
             lost += 1
-            continue
-        latency += [cycles[n].commands[j][0] - cycles[k].replies[j][0] for j in range(len(motors))]
+        else:
+            latency += [cycles[n].commands[j][0] - cycles[k].replies[j][0] for j in range(len(motors))]
     return LoopTiming(
         np.array(latency),
         spacing,
@@ -101,30 +104,38 @@ def analyse(cycles: Sequence[Cycle], motors: Sequence[JointMotor], law: Law, per
     )
 
 
-def _expected_answer(cycle: Cycle, motors: Sequence[JointMotor], law: Law) -> Answer | None:
-    """Return the commands that answer a cycle's replies, None if a reply is missing."""
+def _expected_commands(cycle: Cycle, motors: Sequence[JointMotor], law: Law) -> Commands | None:
+    """Return the commands that answer a cycle's replies, as a function of their damping; None if a reply is missing."""
     if len(cycle.replies) != len(motors):
         return None
-    angles = [motor.sample(cycle.replies[joint][1], 0.0).position for joint, motor in enumerate(motors)]
-    return tuple(motor.command(torque, 0.0) for motor, torque in zip(motors, law(angles), strict=True))
+    torques = law([motor.sample(cycle.replies[joint][1], 0.0).position for joint, motor in enumerate(motors)])
+    return lambda damping: tuple(
+        motor.command(torque, kd) for motor, torque, kd in zip(motors, torques, damping, strict=True)
+    )
 
 
 def _sent_answer(cycle: Cycle, motor_count: int) -> Answer | None:
     """Return a cycle's commands, None if one is missing."""
-    if len(cycle.commands) != motor_count:
-        return None
-    return tuple(cycle.commands[joint][1] for joint in range(motor_count))
+    is_complete = len(cycle.commands) == motor_count
+    return tuple(cycle.commands[joint][1] for joint in range(motor_count)) if is_complete else None
 
 
 def _first_answer(
-    k: int, expected: Sequence[Answer | None], sent: Sequence[Answer | None], starts: np.ndarray
+    k: int,
+    expected: Sequence[Commands | None],
+    sent: Sequence[Answer | None],
+    motors: Sequence[JointMotor],
+    starts: np.ndarray,
 ) -> int | None:
     """Return the index of the first cycle whose commands answer cycle k or a later one."""
-    wanted = set()
     for n in range(k + 1, len(sent)):
-        wanted.add(expected[n - 1])
-        if sent[n] is not None and sent[n] in wanted:
-            return n
+        if (answer := sent[n]) is not None:
+            damping = [
+                motor.wire_format.unpack_command(motor.spec, data).kd * motor.scale_at(None)
+                for motor, data in zip(motors, answer, strict=True)
+            ]
+            if any(commands and commands(damping) == answer for commands in expected[k:n]):
+                return n
         if starts[n] - starts[k] > GIVE_UP:
             return None
     return None
