@@ -43,15 +43,15 @@ class InFile(NamedTuple):
     error: np.ndarray  #: (n,) Nm; COVER times this contains 95 % of the errors of its torque in new poses
 
 
-def held(model: MomentModel, solution: Solution, misfit: np.ndarray, grows: np.ndarray) -> InFile:
+def held(model: MomentModel, new: Rows, solution: Solution, misfit: np.ndarray, grows: np.ndarray) -> InFile:
     """Return what the file holds of a fit, and how well.
 
+    new: the poses in which its torque is judged.
     misfit: (n,) Nm as commanded, root mean square of what noise does not explain of the residuals.
     grows: (n,), by how much of the torque friction grows.
     """
     at, unknowns = layout_of(model), solution.unknowns
-    new, scale = _new_poses(model), np.exp(unknowns[at.scale])
-    kept = unknowns.copy()
+    scale, kept = np.exp(unknowns[at.scale]), unknowns.copy()
     kept[at.offset] *= unknowns[at.spring] > 0.0
     kept[at.tilt] *= model.keeps_tilt
     turns = kept[at.turn].reshape(-1, TURNS)
@@ -70,7 +70,7 @@ def held(model: MomentModel, solution: Solution, misfit: np.ndarray, grows: np.n
     return InFile(kept, np.quantile(np.abs(errors), 0.95, axis=(0, 1)) / COVER)
 
 
-def _new_poses(model: MomentModel) -> Rows:
+def new_poses(model: MomentModel) -> Rows:
     """Return poses at random without a weight, under tilts of the trunk if an IMU measures them."""
     random = np.random.default_rng(2)
     theta = random.choice(model.suggested, POSES)

@@ -38,7 +38,7 @@ import numpy as np
 from exo_gravity.core.arm.springs import MAX_REST, MAX_STIFFNESS
 from exo_gravity.core.errors import DataError
 from exo_gravity.core.numbers import Vector
-from exo_gravity.lab.calibration.held import held
+from exo_gravity.lab.calibration.held import held, new_poses
 from exo_gravity.lab.calibration.moment_model import TURNS, MomentModel
 from exo_gravity.lab.calibration.pose_fit import (
     DISTURBED,
@@ -50,8 +50,8 @@ from exo_gravity.lab.calibration.pose_fit import (
     known_of,
     layout_of,
     rows_at,
-    solve,
     temperatures,
+    with_springs,
     without_outliers,
 )
 from exo_gravity.lab.calibration.poses import missing_pose, shown_by
@@ -144,13 +144,7 @@ def identify(observations: Sequence[Observation], model: MomentModel, places: Pl
     spread = np.hypot(spread, FIT.least_spread)
     keep, rejected = without_outliers(rows, known, effort, spread)
     used, seen, spread = rows.only(keep), effort[keep], spread[keep]
-    while True:
-        solution = solve(used, known, seen, spread)
-        size = solution.unknowns[at.spring] / solution.error[at.spring]
-        size[known.error[at.spring] <= EXACT] = np.inf
-        if size.min() > FIT.asked:
-            break
-        known.error[at.spring][np.argmin(size)] = EXACT  # the others may now stand out
+    solution = with_springs(used, known, seen, spread)
     typical, peak = np.median(np.abs(solution.residual), axis=0), np.abs(seen).max(axis=0)
     for joint in np.flatnonzero(typical > np.maximum(ACCEPTED.misfit * peak, ACCEPTED.least_misfit)):
         misfit = f"joint {joint + 1} is {typical[joint]:.2f} Nm off in half of the poses"
@@ -160,8 +154,6 @@ def identify(observations: Sequence[Observation], model: MomentModel, places: Pl
     if not is_relative and np.all(solution.error[at.scale][joints] > unseen):
         raise DataError("the weight shows no common factor: hang a heavier one, or hold it with a horizontal forearm")
     _check_known(solution.hidden, len(observations), down[-1], model)
-    # Student's distribution: for few poses two standard errors would cover less than 95 %.
-    solution = solution._replace(covariance=solution.covariance * (1.0 + 1.25 / (solution.freedom.min() + 6.0)) ** 2)
     unknowns, error = solution.unknowns, solution.error
     moments, scale = unknowns[at.moment], np.exp(unknowns[at.scale])
     check_physical(moments, error[at.moment], scale, down[-1], model)
@@ -172,7 +164,7 @@ def identify(observations: Sequence[Observation], model: MomentModel, places: Pl
     friction = np.array([observation.friction for observation in observations])
     carried = np.abs(effort) - np.abs(effort).mean(axis=0)
     grows = np.maximum((carried * friction).sum(axis=0) / np.maximum((carried**2).sum(axis=0), 1e-12), 0.0)
-    file = held(model, solution, np.sqrt(beyond_noise.mean(axis=0)), grows)
+    file = held(model, new_poses(model), solution, np.sqrt(beyond_noise.mean(axis=0)), grows)
     residual = effort - rows.predicted(unknowns)
     held_out = residual.copy()
     held_out[keep] = solution.held_out

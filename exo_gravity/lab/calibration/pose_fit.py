@@ -110,7 +110,7 @@ class Known(NamedTuple):
     start: np.ndarray  #: (count,)
     error: np.ndarray  #: (count,), standard errors
     least: np.ndarray  #: (count,), lowest possible values
-    product: np.ndarray  #: (c, count), linear combinations of the change from `start` that are 0
+    product: np.ndarray  #: (c, count), linear combinations of the change from `start` that are 0, by their errors
 
 
 def known_of(model: MomentModel, places: Places, is_relative: bool) -> Known:
@@ -187,12 +187,13 @@ class Rows(NamedTuple):
         return rows, torque, np.exp(-unknowns[at.scale]) / (1.0 + unknowns[at.slope] * self.warmth)
 
 
-def rows_at(model: MomentModel, theta: np.ndarray, direction: np.ndarray, turned: np.ndarray) -> Rows:
+def rows_at(model: MomentModel, theta: np.ndarray, direction: np.ndarray, turned: np.ndarray | None = None) -> Rows:
     """Return the regressor at `theta` (m, n) rad, without a weight, with motors of one temperature.
 
-    direction: (m, 3). turned: (m, n, k, 3, t), the derivative by turns.
+    direction: (m, 3). turned: (m, n, k, 3, t), the derivative by turns, 0 if it is not given.
     """
     load = np.zeros((len(theta), len(model.names)))
+    turned = np.zeros((*theta.shape, len(model.names), 3, TURNS * model.count)) if turned is None else turned
     beside = np.zeros((*load.shape, 2))
     return Rows(model.along_axes(theta), turned, theta, 0.0 * theta, direction, load, beside, layout_of(model))
 
@@ -275,6 +276,27 @@ def solve(rows: Rows, known: Known, effort: np.ndarray, spread: np.ndarray, reac
     moments = np.flatnonzero(hidden[at.moment])
     covariance[moments, moments] = known.error[moments] ** 2
     return Solution(unknowns, covariance, hidden, residual, held_out, usual, freedom)
+
+
+def with_springs(rows: Rows, known: Known, effort: np.ndarray, spread: np.ndarray, slack: float = math.inf) -> Solution:
+    """Return what explains the effort with those springs alone that stand out of their error.
+
+    known: of which the error of the other springs becomes 0. effort, spread: as for `solve`. slack: Nm, standard error
+    of the offset of a joint without a spring, if it is less than before.
+    """
+    at = rows.layout
+    while True:
+        solution = solve(rows, known, effort, spread)
+        size = solution.unknowns[at.spring] / solution.error[at.spring]
+        size[known.error[at.spring] <= EXACT] = np.inf
+        if size.min() > FIT.asked:
+            # Student's distribution: for few poses two standard errors would cover less than 95 %.
+            return solution._replace(
+                covariance=solution.covariance * (1.0 + 1.25 / (solution.freedom.min() + 6.0)) ** 2
+            )
+        least = np.argmin(size)  # the others may now stand out
+        known.error[at.spring][least] = EXACT
+        known.error[at.offset][least] = min(known.error[at.offset][least], slack)
 
 
 def without_outliers(

@@ -343,7 +343,6 @@ def _sensitivity(theta: np.ndarray, direction: Vector, moments: Vector, model: M
     """Return the derivative of the efforts in the poses (m, n) by the unknowns, by their noise: (m, n, count)."""
     at = layout_of(model)
     unknowns = np.append(moments, np.zeros(at.total - len(model.names)))
-    turned = np.zeros((len(theta), model.count, len(model.names), 3, at.turn.stop - at.turn.start))
-    rows = rows_at(model, theta, np.broadcast_to(direction, (len(theta), 3)), turned)
+    rows = rows_at(model, theta, np.broadcast_to(direction, (len(theta), 3)))
     noise = np.hypot(CHOICE.noise, CHOICE.noise_share * rows.predicted(unknowns))
     return np.asarray(rows.jacobian(unknowns) / noise[..., None] * (np.arange(at.total) < at.tilt.start))

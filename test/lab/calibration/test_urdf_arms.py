@@ -26,8 +26,7 @@ from exo_gravity.lab.calibration.poses import TorqueGuess, candidates, next_pose
 from exo_gravity.lab.calibration.result import CalibrationResult, page_of, write_changes
 from exo_gravity.lab.calibration.tours import friction_from, model_of, moments_from
 from exo_gravity.lab.calibration.tracking import Observation
-from exo_gravity.lab.calibration.wearer import WEARER, wearer_from
-from exo_gravity.lab.calibration.worn_arm import WornArm
+from exo_gravity.lab.calibration.wearer import WEARER, WornArm, wearer_from
 from exo_gravity.lab.inputs.arms import ConfiguredArm, configured_arm, read_arm
 from exo_gravity.lab.inputs.parameter_file import load, packaged_config, text_of
 
