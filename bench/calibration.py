@@ -35,9 +35,9 @@ from exo_gravity.core.safety.command import State
 from exo_gravity.core.safety.limits import Limits
 from exo_gravity.lab.calibration.imu import mounting_turn
 from exo_gravity.lab.calibration.moment_model import GRID, MomentModel
-from exo_gravity.lab.calibration.poses import Itinerary, guess_for
+from exo_gravity.lab.calibration.poses import Itinerary
 from exo_gravity.lab.calibration.result import CalibrationResult
-from exo_gravity.lab.calibration.tour import DURATION, Tour, TourController
+from exo_gravity.lab.calibration.tour import Tour, TourController
 from exo_gravity.lab.calibration.tours import SCALE_POSES, moments_from
 from exo_gravity.lab.calibration.tracking import Observation
 from exo_gravity.lab.inputs.arms import configured_arm
@@ -159,8 +159,7 @@ class Device:
         device.pitch, device.roll = stand
         device.advance(SINKING)
         limits, tilt = Limits(ARM.joint_names, max_effort=MAX_EFFORT, sign_check_torque=0.0), Tilt.of("right", *stand)
-        guess = guess_for(MODEL, tilt, load, earlier)
-        tour = Tour(limits, guess, Itinerary(limits, SCALE_POSES, DURATION), RATE, load)
+        tour = Tour(limits, MODEL, Itinerary(limits, SCALE_POSES), RATE, load, earlier)
         played = VirtualArm(
             device, TourController(tour, limits, tilt, lambda: safety.state is State.ACTIVE), ASSUMED, limits, RATE
         )

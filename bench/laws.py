@@ -14,7 +14,7 @@ from exo_gravity.core.compensation.settings import COMPENSATOR, robot_of
 from exo_gravity.core.params import values_of
 from exo_gravity.hardware.urdf_arm import UrdfArm, read_urdf
 from exo_gravity.lab.calibration.moment_model import DescribedModel
-from exo_gravity.lab.calibration.poses import guess_for
+from exo_gravity.lab.calibration.poses import TorqueGuess
 from exo_gravity.lab.inputs.arms import read_arm
 from exo_gravity.lab.inputs.parameter_file import load, packaged_config
 from exo_gravity.lab.inputs.references import pinocchio_model, toolbox_robot
@@ -92,13 +92,13 @@ def _measure_urdf(pin: Any, file: str, blocks: int) -> Iterator[Row]:
     name = f"law of a URDF with {count} joints"
     yield row(f"{name}, 100,000 poses, per pose: Pinocchio in a loop", ours, peer, POSES, LOOP)
     theta, still, tilt = poses[0].tolist(), np.zeros(count), Tilt.of("left")
-    hold = guess_for(DescribedModel(arm.scaled([1.0] * count, arm.gravity), uses_imu=True), tilt).torque
-    np.testing.assert_allclose(hold(theta), np.divide(arm.torque(theta, tilt), arm.gain), atol=1e-9)
+    hold = TorqueGuess(DescribedModel(arm.scaled([1.0] * count, arm.gravity), uses_imu=True)).torque
+    np.testing.assert_allclose(hold(theta, tilt), np.divide(arm.torque(theta, tilt), arm.gain), atol=1e-9)
     loop_pose, peer, tour_pose, regressor = race(
         (
             (lambda: arm.torque(theta, tilt), 500),
             (lambda: pin.computeGeneralizedGravity(model, data, poses[0]), 500),
-            (lambda: hold(theta), 200),
+            (lambda: hold(theta, tilt), 200),
             (lambda: pin.computeJointTorqueRegressor(model, data, poses[0], still, still), 200),
         ),
         blocks,

@@ -23,7 +23,7 @@ from exo_gravity.core.safety.limits import CAN_BRIDGE, Limits, limits_of
 from exo_gravity.core.safety.machine import SafetyMachine
 from exo_gravity.lab.calibration.live import LiveTour
 from exo_gravity.lab.calibration.moment_model import MomentModel
-from exo_gravity.lab.calibration.poses import Itinerary, guess_for, next_pose
+from exo_gravity.lab.calibration.poses import Itinerary, next_pose
 from exo_gravity.lab.calibration.tour import Tour, TourController, calibrator_table, line_of, side_of, tour_of
 from exo_gravity.lab.calibration.tracking import Observation, Station
 from exo_gravity.lab.inputs.arms import node_values
@@ -198,8 +198,8 @@ class TourRun:
         device = SimulatedDevice(SimulatedArm(self.truth), [SimulatedMotor(motor) for motor in self.motors])
         device.pitch, device.roll = self.tilt
         tilt = Tilt.of("right", *self.tilt)
-        guess = guess_for(MomentModel(self.assumed, True), tilt, self.load)
-        tour = Tour(self.limits, guess, itinerary or Itinerary(self.limits, 12, 230.0), self.rate, self.load)
+        model, chosen = MomentModel(self.assumed, True), itinerary or Itinerary(self.limits, 12)
+        tour = Tour(self.limits, model, chosen, self.rate, self.load)
         player = Player(tour, device, MOTORS_AS_MOUNTED, self.limits, self.rate, tilt, self._disturb)
         self.device, self.log = device, player.log
         self.safety = player.play()
@@ -213,4 +213,4 @@ class TourRun:
 
 def fixed(stations: Sequence[Station]) -> Itinerary:
     """Return the itinerary of `stations` alone."""
-    return Itinerary(Limits(NAMES), 0, 0.0, stations)
+    return Itinerary(Limits(NAMES), 0, stations)

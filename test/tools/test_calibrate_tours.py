@@ -96,7 +96,7 @@ def test_a_tour_of_an_arm_with_or_without_cables_holds_it_to_1_percent_of_peak_i
 ) -> None:
     truth = ArmConfig(**cables)
     run = TourRun(truth=truth)
-    tour, seen = run.run(Itinerary(run.limits, 12, 230.0)), Tilt.of("right", *run.tilt)
+    tour, seen = run.run(Itinerary(run.limits, 12)), Tilt.of("right", *run.tilt)
     assert tour.trouble == "" and tour.measured[0].temperature == (30.0,) * 4
     result = moments_from(ARM, tour.measured)
     assert np.any(result.identified.stiffness > 0.0) == bool(cables)
@@ -216,7 +216,7 @@ def test_recordings_without_and_with_the_weight_give_kilograms_and_true_scales(t
     for number, (command, mass, lever) in enumerate((("gravity", 0.0, 0.0), ("scale", 0.5, 0.25))):
         loaded = ArmConfig(TRUTH, wearer_mass=(0.0, 0.0, 0.0, mass), wearer_cog=(0.0, 0.0, 0.0, lever))
         run = TourRun(truth=loaded, motors=motors, load=(mass, lever))
-        run.run(Itinerary(run.limits, 8, 160.0))
+        run.run(Itinerary(run.limits, 8))
         bag = recorded_by(run, tmp_path / command, configured_arm(files[number]).can_bridge["torque_scale"])
         words = ["calibrate", command, "--params", files[number], "--output", files[number + 1], "--bag", bag]
         assert run_tool(*words, *["--mass", mass, "--lever", lever] * bool(mass)).code == 0

@@ -28,7 +28,7 @@ from scipy.optimize import lsq_linear
 from exo_gravity.core.arm.tilt import SIDES, Tilt
 from exo_gravity.core.numbers import COVER
 from exo_gravity.lab.calibration.moment_model import TURNS, MomentModel
-from exo_gravity.lab.calibration.pose_fit import Rows, Solution, layout_of, rows_at
+from exo_gravity.lab.calibration.pose_fit import Rows, Solution, rows_at
 
 POSES = 100  # new ones, at random
 LEAN = 0.15  # rad, standard deviation of the trunk's pitch and roll in these
@@ -50,7 +50,7 @@ def held(model: MomentModel, new: Rows, solution: Solution, misfit: np.ndarray, 
     misfit: (n,) Nm as commanded, root mean square of what noise does not explain of the residuals.
     grows: (n,), by how much of the torque friction grows.
     """
-    at, unknowns = layout_of(model), solution.unknowns
+    at, unknowns = new.layout, solution.unknowns
     scale, kept = np.exp(unknowns[at.scale]), unknowns.copy()
     kept[at.offset] *= unknowns[at.spring] > 0.0
     kept[at.tilt] *= model.keeps_tilt

@@ -184,10 +184,9 @@ def identify(observations: Sequence[Observation], model: MomentModel, places: Pl
 def _check_known(hidden: np.ndarray, count: int, direction: Vector, model: MomentModel) -> None:
     """Raise DataError that names what is missing if `count` poses do not show `hidden` (count,) that others would."""
     at = layout_of(model)
-    missing = hidden & shown_by(model, model.suggested, direction)
     shown = model.upright  # what shows while the base leans needs no pose
-    needed = np.concatenate((shown.any(axis=0), *(shown.any(axis=1),) * 2, np.ones(at.total - at.angle.start, bool)))
-    missing &= needed
+    needed = np.concatenate((shown.any(axis=0), *(shown.any(axis=1),) * 2))
+    missing = hidden[: at.offset.stop] & shown_by(model, model.suggested, direction) & needed
     if np.any(missing):
         names = ", ".join(name for name, is_missing in zip(_names(model), missing, strict=False) if is_missing)
         pose = missing_pose(missing, direction, model)

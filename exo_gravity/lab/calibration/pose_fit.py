@@ -97,10 +97,10 @@ class FitLayout(NamedTuple):
         return int(self.turn.stop)
 
 
-def layout_of(model: MomentModel) -> FitLayout:
-    """Return where the unknowns of an arm stand."""
+def layout_of(model: MomentModel, turns: int = TURNS) -> FitLayout:
+    """Return where the unknowns of an arm stand, of each of whose joints so many `turns` are fitted."""
     joints = model.count
-    ends = np.cumsum((0, len(model.names), joints, joints, 2, 3, joints, joints, TURNS * joints)).tolist()
+    ends = np.cumsum((0, len(model.names), joints, joints, 2, 3, joints, joints, turns * joints)).tolist()
     return FitLayout(*map(slice, ends[:-1], ends[1:]))
 
 
@@ -113,9 +113,13 @@ class Known(NamedTuple):
     product: np.ndarray  #: (c, count), linear combinations of the change from `start` that are 0, by their errors
 
 
-def known_of(model: MomentModel, places: Places, is_relative: bool) -> Known:
-    """Return what is known of an arm; is_relative: without a weight a common factor does not show, which is then 1."""
-    at = layout_of(model)
+def known_of(model: MomentModel, places: Places | None, is_relative: bool) -> Known:
+    """Return what is known of an arm.
+
+    places: how exactly those of its joints are known; None where these are not fitted.
+    is_relative: without a weight a common factor does not show, which is then 1.
+    """
+    at = layout_of(model, TURNS if places else 0)
     start, least, error = np.zeros(at.total), np.full(at.total, -np.inf), np.zeros(at.total)
     start[at.moment] = model.moments
     least[at.spring] = least[list(model.at_least_0)] = 0.0
@@ -124,7 +128,8 @@ def known_of(model: MomentModel, places: Places, is_relative: bool) -> Known:
     error[at.offset], error[at.angle] = FIT.offset, FIT.beside
     error[at.tilt] = FIT.tilt if model.shows_tilt else EXACT
     error[at.spring], error[at.slope] = FIT.spring, FIT.slope
-    error[at.turn] = np.resize((places.zero, places.axis, places.axis), TURNS * model.count)
+    if places:
+        error[at.turn] = np.tile((places.zero, places.axis, places.axis), model.count)
     if model.shows_tilt:
         error[at.turn][:TURNS] = 0.0  # the whole arm turns with its first joint, which is the same as gravity turned
     product = np.eye(at.total)[at.scale][model.compared].sum(axis=0, keepdims=True) * is_relative
@@ -190,16 +195,18 @@ class Rows(NamedTuple):
 def rows_at(model: MomentModel, theta: np.ndarray, direction: np.ndarray, turned: np.ndarray | None = None) -> Rows:
     """Return the regressor at `theta` (m, n) rad, without a weight, with motors of one temperature.
 
-    direction: (m, 3). turned: (m, n, k, 3, t), the derivative by turns, 0 if it is not given.
+    direction: (m, 3). turned: (m, n, k, 3, t), the derivative by turns, without which none is fitted.
     """
     load = np.zeros((len(theta), len(model.names)))
-    turned = np.zeros((*theta.shape, len(model.names), 3, TURNS * model.count)) if turned is None else turned
     beside = np.zeros((*load.shape, 2))
-    return Rows(model.along_axes(theta), turned, theta, 0.0 * theta, direction, load, beside, layout_of(model))
+    is_fixed = turned is None
+    turned = np.zeros((*theta.shape, len(model.names), 3, 0)) if turned is None else turned
+    layout = layout_of(model, 0 if is_fixed else TURNS)
+    return Rows(model.along_axes(theta), turned, theta, 0.0 * theta, direction, load, beside, layout)
 
 
 class Solution(NamedTuple):
-    """A fit. What the poses do not show is as it was before."""
+    """A fit."""
 
     unknowns: np.ndarray  #: (count,)
     covariance: np.ndarray  #: (count, count)
@@ -271,15 +278,13 @@ def solve(rows: Rows, known: Known, effort: np.ndarray, spread: np.ndarray, reac
     measured[at.tilt], measured[at.turn] = 0.0, 0.0
     hidden = np.diag(covariance_at(measured)) > FIT.hidden * known.error**2
     hidden[at.angle.start :] = False  # what is known of these before is true of every arm
-    unknowns = np.where(hidden | (known.error <= EXACT), known.start, unknowns)
-    covariance[hidden] = covariance[:, hidden] = 0.0
-    moments = np.flatnonzero(hidden[at.moment])
-    covariance[moments, moments] = known.error[moments] ** 2
     return Solution(unknowns, covariance, hidden, residual, held_out, usual, freedom)
 
 
 def with_springs(rows: Rows, known: Known, effort: np.ndarray, spread: np.ndarray, slack: float = math.inf) -> Solution:
     """Return what explains the effort with those springs alone that stand out of their error.
+
+    What the poses do not show is as it was before.
 
     known: of which the error of the other springs becomes 0. effort, spread: as for `solve`. slack: Nm, standard error
     of the offset of a joint without a spring, if it is less than before.
@@ -297,6 +302,14 @@ def with_springs(rows: Rows, known: Known, effort: np.ndarray, spread: np.ndarra
         least = np.argmin(size)  # the others may now stand out
         known.error[at.spring][least] = EXACT
         known.error[at.offset][least] = min(known.error[at.offset][least], slack)
+    hidden = solution.hidden
+    unknowns = np.where(hidden | (known.error <= EXACT), known.start, solution.unknowns)
+    # Student's distribution: for few poses two standard errors would cover less than 95 %.
+    covariance = solution.covariance * (1.0 + 1.25 / (solution.freedom.min() + 6.0)) ** 2
+    covariance[hidden] = covariance[:, hidden] = 0.0
+    moments = np.flatnonzero(hidden[at.moment])
+    covariance[moments, moments] = known.error[moments] ** 2
+    return solution._replace(unknowns=unknowns, covariance=covariance)
 
 
 def without_outliers(

@@ -3,8 +3,9 @@
 
 Pure: time is an argument. At each pose all joints sweep through it there and back: the mean of both directions is
 gravity, half of the difference is friction. What was measured improves the expected torque, which carries the arm and
-distinguishes a hand on it from its weight. The tour begins and ends at the hanging arm; after trouble it withdraws its
-efforts. Its record has one line of JSON for each pose, as `calibrator` prints it.
+distinguishes a hand on it from its weight. Where motors vibrate the arm moves more slowly; a pose in which a joint
+sticks is left out. The tour begins and ends at the hanging arm; after trouble it withdraws its efforts. Its record has
+one line of JSON for each pose, as `calibrator` prints it.
 """
 
 import json
@@ -26,8 +27,8 @@ from exo_gravity.core.numbers import Torque
 from exo_gravity.core.params import Param, table_for
 from exo_gravity.core.safety.command import Efforts
 from exo_gravity.core.safety.limits import CAN_BRIDGE, Limits
-from exo_gravity.lab.calibration.moment_model import model_of
-from exo_gravity.lab.calibration.poses import Itinerary, TorqueGuess, friction_stations, guess_for
+from exo_gravity.lab.calibration.moment_model import MomentModel, model_of
+from exo_gravity.lab.calibration.poses import Itinerary, TorqueGuess, friction_stations
 from exo_gravity.lab.calibration.tracking import MOTION, Line, Observation, Station, Sweep, Tracker, average, followed
 from exo_gravity.sim.controllers import SampleController
 
@@ -35,17 +36,16 @@ from exo_gravity.sim.controllers import SampleController
 # tips over: with 1 kg, and motors 17 % stronger than the file says, it swung out to 0.9 rad before the tour began.
 WAITING_SHARE = 0.5
 MAX_FAILURES = 3  # pairs of sweeps in which a joint may stick: each shows the controller more of its friction
-MAX_SKIPPED = 4  # poses in which a joint may stick
+MAX_LEFT_OUT = 4  # poses in which a joint may stick, before the tour ends with what it has
 RAISED = 4  # chosen poses of a tour for friction: they show what depends on the torque
 STEADY_SPEED = 0.05  # rad/s of a sweep, from which on its friction is that of the motion between poses
 REFRESH_PERIOD = 0.1  # s between two estimates of the mass matrix, and of how uncertain the expected torque is
 # What stops a tour.
-MAX_ERROR = 0.12  # rad between a joint and the slow reference,
-MAX_SOFT_ERROR = 0.18  # and under gains that were lowered because motors vibrated
+MAX_ERROR = 0.12  # rad between a joint and the slow reference
 FASTEST = 1.0  # rad/s of a joint; a light joint that leaves its friction reaches 0.5
 MAX_VIBRATIONS = 10  # of a motor, under the lowest gains
-# Nm, of the controllers, in addition to what is unknown of weight and friction; under lowered gains
-MAX_CORRECTION, MAX_SOFT_CORRECTION = 0.5, 1.0
+MAX_CORRECTION = 0.5  # Nm, of the controllers, in addition to what is unknown of weight and friction
+SOFT = 1.5  # times both, under gains that were lowered because motors vibrated
 DEVIATIONS = 3.0  # of the expected torque
 UNKNOWN_FRICTION = 1.0  # Nm, until it is measured
 PERSISTENCE = 0.25  # s for which a torque must be unexplained
@@ -65,13 +65,22 @@ MAX_UNREST = (0.12, 0.25, 0.05)  # Nm, share of friction, share of the torque: b
 class Tour:
     """One tour. Call `wait` for each joint state until the arm is carried, then `step`; and `plan` again and again.
 
+    model: of the arm, of which `earlier` tours showed something. itinerary: which poses it visits.
+    rate: of joint states, Hz. load: a weight in kg, and its distance from the last joint in m.
+
     measured: so far. trouble: why it ended early, as a sentence that names joint, value and limit, or ''. done: whether
     the arm hangs again after the last pose. progress: what it does, as a sentence. elapsed: s since the first step.
     temperature: (n,) degC of the motors, set by who knows it; () if it is not known.
     """
 
     def __init__(
-        self, limits: Limits, guess: TorqueGuess, itinerary: Itinerary, rate: float, load: tuple[float, float] = (0, 0)
+        self,
+        limits: Limits,
+        model: MomentModel,
+        itinerary: Itinerary,
+        rate: float,
+        load: tuple[float, float] = (0.0, 0.0),
+        earlier: Sequence[Observation] = (),
     ) -> None:
         self.measured: list[Observation] = []
         self.trouble = ""
@@ -80,23 +89,24 @@ class Tour:
         self.elapsed = 0.0
         self.temperature: Sequence[float] = ()
         self._limits, self._most = limits, np.array(limits.max_effort)
-        self._guess, self._itinerary, self._load = guess, itinerary, load
+        self._itinerary, self._load, self._earlier = itinerary, load, earlier
+        self._guess = TorqueGuess(model, load, earlier)
         self._tracker = Tracker(rate, limits.max_effort)
-        self._first_tilt = guess.tilt
+        self._first_tilt = self._tilt = Tilt.of(SIDES[0])
         self._now = -math.inf
-        self._position = np.zeros(guess.model.count)  # rad, at the end of the present line
-        self._skipped = 0  # poses
+        self._position = np.zeros(model.count)  # rad, at the end of the present line
+        self._left_out: list[str] = []  # why, of each pose
         self._awaits_plan, self._undecided = False, 0.0  # whether a pose is to be chosen, and s since then
         self._plan: tuple[Station | None, str] = (None, "")  # the next pose, or None to go home, and the trouble
-        self._friction = np.zeros(guess.model.count)  # Nm, 0 until it is measured
-        self._unexplained = np.zeros(guess.model.count)  # s
+        self._next_guess = self._guess
+        self._friction = np.zeros(model.count)  # Nm, 0 until it is measured
+        self._unexplained = np.zeros(model.count)  # s
         self._refreshed = -math.inf
-        self._matrix, self._uncertain = np.eye(guess.model.count), np.zeros(guess.model.count)
+        self._matrix, self._uncertain = np.eye(model.count), np.zeros(model.count)
 
     def wait(self, position: Sequence[float], tilt: Tilt) -> Torque:
         """Return the effort (n,) in Nm at `position` (n,) rad, while the arm is not yet carried: it goes on hanging."""
-        self._guess.tilt = tilt
-        return tuple(WAITING_SHARE * torque for torque in self._guess.torque(position))
+        return tuple(WAITING_SHARE * torque for torque in self._guess.torque(position, tilt))
 
     def step(self, now: float, position: Sequence[float], velocity: Sequence[float], tilt: Tilt) -> Torque | None:
         """Return the effort (n,) in Nm at `now` s, None after trouble.
@@ -105,8 +115,7 @@ class Tour:
         """
         if self.trouble:
             return None
-        self._guess.tilt = tilt
-        expected = self._guess.torque(position)
+        self._tilt, expected = tilt, self._guess.torque(position, tilt)
         if self.done:  # the bridge lets the arm down: it is no longer watched
             return tuple(np.clip(expected + self._tracker.correction, -self._most, self._most).tolist())
         if self._now == -math.inf:
@@ -116,11 +125,10 @@ class Tour:
         dt, self._now = now - self._now, now
         self.elapsed += dt
         self._undecided = self._undecided + dt if self._awaits_plan else 0.0
-        if now - self._refreshed > REFRESH_PERIOD:
-            self._refreshed = now
-            self._matrix = self._guess.matrix(position, self._load)
-            self._uncertain = self._guess.torques(np.array([position]))[1][0]
         down = self._guess.model.down(tilt)
+        if now - self._refreshed > REFRESH_PERIOD:
+            self._refreshed, self._matrix = now, self._guess.matrix(position)
+            self._uncertain = self._guess.torques(np.array([position]), down)[1][0]
         effort = self._tracker.step(dt, position, velocity, expected, down, self._matrix)
         self.trouble = self.trouble or self._wrong_motion(dt, tilt) or self._wrong_torque(dt)
         return None if self.trouble else effort
@@ -133,9 +141,8 @@ class Tour:
             return f"the next pose was not chosen within {LONGEST_CHOICE:g} s: is this computer too busy?"
         if (moved := angle_between(tilt.direction, self._first_tilt.direction)) > MAX_TILT:
             return f"the trunk tilted by {moved:.2f} rad during the measurement, the limit is {MAX_TILT:g}"
-        tracker = self._tracker
+        tracker, most = self._tracker, MAX_ERROR * self._softness
         joints = zip(self._limits.joint_names, tracker.error, tracker.speed, tracker.vibrations, strict=True)
-        most = MAX_SOFT_ERROR if tracker.is_soft.any() else MAX_ERROR
         for name, behind, speed, vibrations in joints:
             if not abs(behind) <= most:
                 return f"{name}: {abs(behind):.2f} rad off its path, the limit is {most:g}{self._because(HAND)}"
@@ -151,29 +158,39 @@ class Tour:
             most = f"max_effort = {self._most[i]:g} Nm"
             return f"{self._limits.joint_names[i]}: saturated: the pose needs more than {most}{self._because()}"
         torque, slide = self._tracker.correction, np.where(self._friction, 0.5 * self._friction, UNKNOWN_FRICTION)
-        own = MAX_SOFT_CORRECTION if self._tracker.is_soft.any() else MAX_CORRECTION
-        limit = own + DEVIATIONS * self._uncertain + slide
+        limit = MAX_CORRECTION * self._softness + DEVIATIONS * self._uncertain + slide
         self._unexplained = np.where(np.abs(torque) > limit, self._unexplained + dt, 0.0)
         for i in np.flatnonzero(self._unexplained > PERSISTENCE):
             beyond = f"{torque[i]:.2f} Nm beyond its weight and friction, the limit is {limit[i]:.2f}"
             return f"{self._limits.joint_names[i]}: {beyond}{self._because(HELD)}"
         return ""
 
+    @property
+    def _softness(self) -> float:
+        """By how much more than usual the arm may be off."""
+        return SOFT if self._tracker.lowered else 1.0
+
     def _because(self, usual: str = "") -> str:
         """Return what ended the tour, after a colon: vibration if it has lowered the gains, else the `usual` reason."""
-        reason = VIBRATED if self._tracker.is_soft.any() else usual
+        reason = VIBRATED if self._tracker.lowered else usual
         return f": {reason}" if reason else ""
 
     def plan(self) -> None:
-        """Choose the next pose if one is due. It takes 0.1 s and more: not on the thread of `step`.
+        """Fit what was measured, and choose the next pose, if one is due.
+
+        It takes 0.1 s and more: not on the thread of `step`.
 
         Any error of the choice ends the tour: without a next pose the arm would be held for ever.
         """
         if not self._awaits_plan:
             return
         try:
-            taken = np.array([measured.theta for measured in self.measured]).reshape(-1, self._guess.model.count)
-            self._plan = self._itinerary.next(taken, self._position, self.elapsed, self._guess, self._friction), ""
+            model = self._guess.model
+            self._next_guess = guess = TorqueGuess(model, self._load, [*self._earlier, *self.measured])
+            taken = np.array([measured.theta for measured in self.measured]).reshape(-1, model.count)
+            state = taken, self._position, guess, model.down(self._tilt), self._friction
+            is_over = len(self._left_out) > MAX_LEFT_OUT
+            self._plan = None if is_over else self._itinerary.next(*state), ""
         except ExoGravityError as error:
             self._plan = (None, str(error))
         except Exception as error:
@@ -187,11 +204,15 @@ class Tour:
             self._awaits_plan = True
             while self._awaits_plan:
                 yield Line(self._position, self._position)
+            here, before = self._position.tolist(), self._guess
             station, self.trouble = self._plan
+            self._guess = self._next_guess
+            self._tracker.shift(np.subtract(self._guess.torque(here, self._tilt), before.torque(here, self._tilt)))
             if station is None:
                 break
             angles = " ".join(f"{math.degrees(angle):.0f}" for angle in station.theta)
-            self.progress = f"pose {len(self.measured) + 1} of {self._itinerary.count}: {angles} deg"
+            left_out = "".join(f"; left out: {why}" for why in self._left_out[-1:])
+            self.progress = f"pose {len(self.measured) + 1} of {self._itinerary.count}: {angles} deg{left_out}"
             start, self._position = self._position, station.ends[0]
             yield Line(start, self._position)
             yield from self._sweeps(station)
@@ -201,7 +222,7 @@ class Tour:
         yield Line(home, home)
 
     def _sweeps(self, station: Station) -> Iterator[Line]:
-        """Yield each sweep until enough were good, or a joint sticks too often; keep what they show."""
+        """Yield each sweep until enough were good, and keep what they show; or leave the pose out if a joint sticks."""
         failures, sweeps = 0, list[Sweep]()
         while len(sweeps) < 2 * station.cycles:
             lowered = self._tracker.lowered
@@ -210,23 +231,18 @@ class Tour:
                 # Sweep again: neither friction nor gravity shows while motors vibrate.
                 sweeps = []
                 continue
-            sweeps += pair
             share, was_known = followed(pair, station), bool(np.any(self._friction))
             sticks = bool(np.min(share) < MOTION.followed)
-            self._tracker.sticks |= share < MOTION.followed
             if station.speed >= STEADY_SPEED:
                 self._friction = np.maximum(average(pair)[0].friction, self._friction if sticks else 0.0)
                 self._tracker.friction = self._friction
             # Sweep again what passed without friction, or what a joint did not follow.
-            if sticks or not was_known:
-                sweeps = []
+            sweeps = [] if sticks or not was_known else sweeps + pair
             failures += sticks
             if failures > MAX_FAILURES:
-                self._skipped += 1
-                if self._skipped > MAX_SKIPPED:
-                    name, least = self._limits.joint_names[int(np.argmin(share))], float(np.min(share))
-                    what = f"it follows {least:.0%} of a slow motion, must be {MOTION.followed:.0%}"
-                    self.trouble = f"{name}: it sticks: {what}{self._because()}"
+                name, least = self._limits.joint_names[int(np.argmin(share))], float(np.min(share))
+                what = f"follows {least:.0%} of a slow motion, must be {MOTION.followed:.0%}"
+                self._left_out.append(f"a pose in which {name} sticks: it {what}")
                 return
         self._keep(station, sweeps)
 
@@ -244,9 +260,6 @@ class Tour:
         weight, lever = self._load
         seen = seen._replace(effort=effort, load_mass=weight, load_lever=lever)
         self.measured.append(seen._replace(speed=station.speed, temperature=tuple(self.temperature)))
-        before = self._guess.torque(theta.tolist())
-        self._guess.learn(theta, effort, seen.spread)
-        self._tracker.shift(np.subtract(self._guess.torque(theta.tolist()), before))
 
 
 class TourController(SampleController):
@@ -300,7 +313,6 @@ ARM = (
 )  # fmt: skip
 LIMITS = ("position_min", "position_max", "max_effort")
 BRIDGE = ("rate", *LIMITS, "motor", "home")  # as can_bridge's
-DURATION = 230.0  # s of a tour, for which the poses are chosen
 OWN = (
     Param("tour.poses", 12, "number of poses that are chosen", (1, 100), fixed=True),
     Param("tour.again", 0, "number of the first poses that are visited again at the end", (0, 100), fixed=True),
@@ -342,8 +354,6 @@ def tour_of(values: Mapping[str, Any]) -> Tour:
     limits = Limits(tuple(values["joint_names"]), **{name: values[name] for name in (*LIMITS, "home")})
     model = model_of(values, (values["tour.wearer_mass"], values["tour.wearer_cog"]))
     earlier = observations_in(Path(values["tour.earlier"]), model.count) if values["tour.earlier"] else []
-    guess = guess_for(model, Tilt.of(side_of(values)), load, earlier)
     given = friction_stations(limits) if values["tour.friction"] else ()
     count = len(given) + RAISED if given else values["tour.poses"]
-    itinerary = Itinerary(limits, count, DURATION, given, values["tour.again"])
-    return Tour(limits, guess, itinerary, values["rate"], load)
+    return Tour(limits, model, Itinerary(limits, count, given, values["tour.again"]), values["rate"], load, earlier)

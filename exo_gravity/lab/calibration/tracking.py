@@ -5,15 +5,14 @@ All joints sweep through a pose there and back. At the same angle the torque of 
 that of the way back gravity minus friction.
 
 The arm follows a slow reference by expected gravity torque, friction, and a PID controller in joint space. Its output
-is an acceleration, which the arm's approximate mass matrix turns into torques: so each joint has the natural frequency
-that it is given, however they are coupled.
+is an acceleration, which the arm's approximate mass matrix turns into torques: so all joints have one natural
+frequency, however they are coupled.
 
 Behind an elastic joint the links no longer hold the rotor: above their resonance the controller moves the rotor alone,
 which has 1 to 20 % of the inertia that the gains are for. An AK60-6 on 1,000 Nm/rad rings at 170 Hz, beyond what 250 Hz
 sample. Nobody knows that before the first tour. So the tracker begins with the gains of a rigid arm, which pass
-Stribeck friction best. When a motor vibrates it lowers those of all joints, and then further those of each whose motor
-still does. Lowered gains pass a low-pass filter, which leaves nothing of them at the rotor's frequencies. A frequency
-that was lowered where a joint carries much inertia is raised where it carries little: there the joint would stick.
+Stribeck friction best. Each time that a motor vibrates, it lowers the gains, and the speed with them. Lowered gains
+pass a low-pass filter, which leaves nothing of them at the rotor's frequencies.
 """
 
 import math
@@ -50,12 +49,10 @@ class TrackerTuning:
     #: natural frequency in rad/s per control cycle per s; two cycles of delay cost 27 degrees
     frequency_per_rate: float = 0.12
     max_frequency: float = 20.0  #: rad/s
-    soft_frequency: float = 8.0  #: rad/s, the most once a motor has vibrated,
-    soft_stiffness: float = 5.0  #: Nm/rad, of inertia times its square, the most once it has vibrated again
+    soft_frequency: float = 8.0  #: rad/s, the most once a motor has vibrated
     softer: float = 0.7  #: of the frequency, each time that a motor vibrates still
     slowest: float = 0.1  #: rad/s: the speed falls to it with a frequency below soft_frequency
     least_frequency: float = 2.5  #: rad/s: 0.6 kg m^2 on 150 Nm/rad oscillate with 5, at 10 Hz (measured)
-    least_stiffness: float = 1.2  #: Nm/rad: with less, a light joint hardly follows against its friction (measured)
     #: times the frequency, where the low-pass filter of lowered gains begins: three of them in a row cost 35 degrees
     #: where the gain is 1, and leave 3 % of it at twice the frequency that the filter begins with
     filtered_from: float = 10.0
@@ -76,9 +73,6 @@ class TrackerTuning:
     slow_error: float = 0.04  #: rad behind the reference, from which on it slows down,
     stop_error: float = 0.08  #: and at which it waits
     full_friction_speed: float = 0.03  #: rad/s of the reference, from which on friction is compensated fully
-    standing: float = 0.03  #: rad/s, below which a joint that sticks is pushed off; one step of the velocity's 12 bits
-    push_off_rate: float = 1.5  #: Nm/s: a light joint at 100 Hz is late by 0.01 rad for 0.1 Nm of Stribeck friction
-    most_push_off: float = 0.3  #: Nm, less what the controller gives at `slow_error`: more would throw a heavy joint
 
 
 MOTION, TRACKER = MotionTuning(), TrackerTuning()
@@ -206,9 +200,9 @@ class Vibration:
         self._swings = np.where(goes_on, self._swings + is_turned, 0.0)
         return np.asarray(self._swings >= TRACKER.swings)
 
-    def forget(self, which: np.ndarray) -> None:
-        """Count the swings of motors anew; which: (n,) whether it is one of them."""
-        self._swings = np.where(which, 0.0, self._swings)
+    def forget(self) -> None:
+        """Count the swings of all motors anew."""
+        self._swings = 0.0 * self._swings
 
 
 class Tracker:
@@ -219,11 +213,9 @@ class Tracker:
 
     lines: to follow, each taken when it begins; the owner sets them before the first step.
     friction: (n,) Nm, compensated in the direction of motion, as far as the owner knows it.
-    sticks: (n,), set by the owner, whether a joint has not followed a sweep: it is then pushed off wherever it stands.
     saturated: (n,) s for which each joint has wanted more than its `max_effort`.
     error: (n,) rad by which the arm is behind its path.
     correction: (n,) Nm, what the controller added to gravity and friction in the last step.
-    speed: (n,) rad/s of the joints, without vibration.
     lowered: how often gains were lowered because motors vibrated.
     vibrations: (n,) how often each joint's motor has vibrated under the lowest gains.
     """
@@ -234,18 +226,15 @@ class Tracker:
         self.saturated = np.zeros(count)
         self.error = np.zeros(count)
         self.correction = np.zeros(count)
-        self.sticks = np.zeros(count, bool)
         self.lowered = 0
         self.vibrations = np.zeros(count)
         self._vibration = Vibration(count)
-        self._rigid = min(TRACKER.max_frequency, TRACKER.frequency_per_rate * rate)  # rad/s, of a rigid arm
-        self._frequency = np.full(count, self._rigid)
-        self._is_soft, self._calm = np.zeros(count, bool), np.zeros(count)  # whether lowered, and s left to calm down
+        self._frequency = min(TRACKER.max_frequency, TRACKER.frequency_per_rate * rate)  # rad/s
+        self._calm = 0.0  # s left to calm down
         self._filter = np.zeros((TRACKER.filter_order, count))  # Nm, what each filter passes
         self._max_effort = np.array(max_effort)
         self._integral = np.zeros(count)
         self._slide = np.zeros(count)  # Nm that compensate friction
-        self._push_off = np.zeros(count)  # Nm beyond that, of joints that stick
         self._effort: Torque = (0.0,) * count
         self.lines: Iterator[Line] = iter(())
         self._line = Line(self.error, self.error)
@@ -281,7 +270,7 @@ class Tracker:
         # The path does not wait for a joint that is ahead: it would not come back against its friction.
         behind = float(np.where(self._line.way, self.error * self._line.way, np.abs(self.error)).max())
         pace = max(0.0, min(1.0, (TRACKER.stop_error - behind) / (TRACKER.stop_error - TRACKER.slow_error)))
-        pace = min(pace, self._fastest() / self._line.speed) if self._line.duration else pace
+        pace = min(pace, self.fastest / self._line.speed) if self._line.duration else pace
         self._time += pace * dt
         if self._samples is not None and self._line.is_measured(self._time):
             # The effort of the last cycle brought the arm here.
@@ -289,65 +278,40 @@ class Tracker:
         # Friction is compensated before the motion begins: a joint that breaks away late would jump.
         coming = self._line.at(self._time + MOTION.lead)[1] if self._time < MOTION.lead else heading
         speed_error = pace * heading - velocity
-        inertia = np.diag(matrix)
-        self._watch_vibration(dt, velocity, inertia)
+        self._watch_vibration(dt, velocity)
         self._compensate_friction(dt, coming, speed_error)
-        frequency = self._frequencies(inertia)
-        self._push(dt, np.sign(coming), np.asarray(velocity), inertia * frequency**2)
-        loaded = matrix + TRACKER.added * np.eye(len(matrix))
-        self._effort = self._controlled(dt, speed_error, expected, loaded, frequency)
+        self._effort = self._controlled(dt, speed_error, expected, matrix + TRACKER.added * np.eye(len(matrix)))
         return self._effort
 
     @property
-    def is_soft(self) -> np.ndarray:
-        """Whether the gains of each joint (n,) were lowered because motors vibrated."""
-        return self._is_soft
-
-    @property
     def speed(self) -> np.ndarray:
-        """The mean speeds (n,) of the joints in rad/s."""
+        """The mean speeds (n,) of the joints in rad/s, without vibration."""
         return self._vibration.speed
 
-    def _fastest(self) -> float:
-        """Return the speed in rad/s at which the arm may be moved.
+    @property
+    def fastest(self) -> float:
+        """The speed in rad/s at which the arm may be moved.
 
-        It falls with the lowest natural frequency: so does the rate at which the integral part follows a torque that
-        differs from what was expected.
+        It falls with lowered gains: so does the rate at which the integral part follows a torque that differs from what
+        was expected.
         """
-        share = float(self._frequency.min()) / TRACKER.soft_frequency if self._is_soft.any() else 1.0
+        share = self._frequency / TRACKER.soft_frequency if self.lowered else 1.0
         return max(TRACKER.slowest, min(1.0, share) * MOTION.speed)
 
-    def _watch_vibration(self, dt: float, velocity: Vector, inertia: np.ndarray) -> None:
-        """Lower the gains of joints whose motors vibrate, without a step of what they hold.
-
-        velocity: (n,) rad/s. inertia: (n,) kg m^2.
-        """
-        self._calm = np.maximum(0.0, self._calm - dt)
-        vibrates = self._vibration.step(dt, velocity) & (self._calm == 0.0)
-        if not vibrates.any():
+    def _watch_vibration(self, dt: float, velocity: Vector) -> None:
+        """Lower the gains if a motor vibrates, without a step of what they hold; velocity: (n,) rad/s."""
+        self._calm = max(0.0, self._calm - dt)
+        vibrates = self._vibration.step(dt, velocity)
+        if self._calm or not vibrates.any():
             return
-        if not self._is_soft.any():
-            vibrates |= True  # the others are about to
-        self.lowered += 1
-        least, present = _least_frequencies(inertia), self._frequencies(inertia)
-        self.vibrations += vibrates & (present <= least)
-        softer = np.minimum(TRACKER.softer * present, np.sqrt(TRACKER.soft_stiffness / inertia))
-        wanted = np.where(self._is_soft, softer, TRACKER.soft_frequency)
-        lower = np.minimum(np.maximum(wanted, least), present)
-        left = np.where(vibrates, (lower / present) ** 2, 1.0)
-        self._frequency = np.where(vibrates, lower, self._frequency)
+        self.vibrations += vibrates & (self._frequency <= TRACKER.least_frequency)
+        softer = TRACKER.softer * self._frequency if self.lowered else TRACKER.soft_frequency
+        lower = max(TRACKER.least_frequency, min(softer, self._frequency))
+        left = (lower / self._frequency) ** 2
+        self._frequency, self._calm, self.lowered = lower, TRACKER.calm, self.lowered + 1
         self._integral += (1.0 - left) * self._filter[-1]
         self._filter *= left
-        self._is_soft |= vibrates
-        self._calm = np.where(vibrates, TRACKER.calm, self._calm)
-        self._vibration.forget(vibrates)
-
-    def _frequencies(self, inertia: np.ndarray) -> np.ndarray:
-        """Return the natural frequencies (n,) in rad/s of the joints, which carry `inertia` (n,) kg m^2."""
-        if not self._is_soft.any():
-            return self._frequency
-        least = np.minimum(_least_frequencies(inertia), self._rigid)
-        return np.where(self._is_soft, np.maximum(self._frequency, least), self._frequency)
+        self._vibration.forget()
 
     def _compensate_friction(self, dt: float, heading: np.ndarray, speed_error: np.ndarray) -> None:
         """Compensate friction by and by towards `heading` (n,) rad/s, and no further in a joint that is ahead."""
@@ -357,26 +321,13 @@ class Tracker:
         is_ahead = (self.error * way < -TRACKER.ahead) | (speed_error * way < -TRACKER.faster)
         self._slide += np.where(is_ahead & (change * way > 0.0), 0.0, change)
 
-    def _push(self, dt: float, way: np.ndarray, velocity: np.ndarray, stiffness: np.ndarray) -> None:
-        """Push light joints that stick, stand and are behind towards `way` (n,), -1, 0 or 1.
-
-        velocity: (n,) rad/s. stiffness: (n,) Nm/rad of the controller, which moves a heavy joint by itself.
-        """
-        most = np.maximum(0.0, TRACKER.most_push_off - stiffness * TRACKER.slow_error)
-        stands = self.sticks & (np.abs(velocity) < TRACKER.standing) & (self.error * way > TRACKER.ahead)
-        more = self._push_off + TRACKER.push_off_rate * dt * way
-        self._push_off = np.where(stands, np.clip(more, -most, most), 0.0)
-
-    def _controlled(
-        self, dt: float, speed_error: np.ndarray, expected: Torque, matrix: np.ndarray, frequency: np.ndarray
-    ) -> Torque:
-        root = np.sqrt(frequency)
-        stiff = frequency * (matrix @ (frequency * self.error))
-        push = self._filtered(dt, stiff + 2.0 * root * (matrix @ (root * speed_error)), frequency)
-        weakest = float(np.linalg.eigvals(matrix).real.min())
+    def _controlled(self, dt: float, speed_error: np.ndarray, expected: Torque, matrix: np.ndarray) -> Torque:
+        frequency, weakest = self._frequency, float(np.linalg.eigvals(matrix).real.min())
+        stiff = frequency**2 * (matrix @ self.error)
+        push = self._filtered(dt, stiff + 2.0 * frequency * (matrix @ speed_error))
         floor = TRACKER.floor * weakest * self.error * frequency**2
         integral = self._integral + TRACKER.integral_share * frequency * dt * (stiff + floor)
-        torque = expected + self._slide + self._push_off + push + integral
+        torque = expected + self._slide + push + integral
         is_saturated = np.abs(torque) > self._max_effort
         self.saturated = np.where(is_saturated, self.saturated + dt, 0.0)
         # Without this the integral would wind up.
@@ -384,16 +335,10 @@ class Tracker:
         self.correction = push + self._integral
         return tuple(np.clip(torque, -self._max_effort, self._max_effort).tolist())
 
-    def _filtered(self, dt: float, push: np.ndarray, frequency: np.ndarray) -> np.ndarray:
-        """Return `push` (n,) Nm, in joints with lowered gains without what the rotor could vibrate with."""
-        passed, value = 1.0 - np.exp(-TRACKER.filtered_from * frequency * dt), push
+    def _filtered(self, dt: float, push: np.ndarray) -> np.ndarray:
+        """Return `push` (n,) Nm, of lowered gains without what the rotor could vibrate with."""
+        passed, value = 1.0 - math.exp(-TRACKER.filtered_from * self._frequency * dt), push
         for stage in self._filter:
             stage += passed * (value - stage)
             value = stage
-        return np.where(self._is_soft, value, push)
-
-
-def _least_frequencies(inertia: np.ndarray) -> np.ndarray:
-    """Return the lowest natural frequencies (n,) in rad/s of joints that carry `inertia` (n,) kg m^2."""
-    least = np.maximum(TRACKER.least_frequency, np.sqrt(TRACKER.least_stiffness / inertia))
-    return np.asarray(np.minimum(least, TRACKER.soft_frequency))
+        return value.copy() if self.lowered else push

@@ -102,7 +102,7 @@ class WornArm:
 
     def _known(self, mass: np.ndarray, cog: np.ndarray) -> Known:
         """Return what is known, for a wearer of mass (n,) in kg at cog (n,) in m on the links."""
-        at, deviations = layout_of(self.model), []
+        at, deviations = layout_of(self.model, 0), []
         for link in np.flatnonzero(mass):
             heavier = PRIOR.mass * np.append(1.0, cog[link] * self.model.directions[link])
             of_link = mass[link] * np.vstack((heavier, PRIOR.place * np.eye(4)[1:]))  # mass, and moments along x, y, z
@@ -146,7 +146,7 @@ def wearer_from(
     not show an arm.
     """
     worn, observations = WornArm(arm), at_links(arm, observations)
-    model, at, count = worn.model, layout_of(worn.model), len(arm.joint_names)
+    model, at, count = worn.model, layout_of(worn.model, 0), len(arm.joint_names)
     theta, direction, effort, spread = columns(observations)
     of_two = itertools.combinations(range(len(theta)), 2)
     visits = [pair for pair in of_two if np.ptp(theta[list(pair)], axis=0).max() < WEARER.same_pose]

@@ -257,8 +257,8 @@ def test_an_arm_whose_urdf_comes_from_a_topic_or_that_has_other_joints_is_refuse
 
 def test_the_choice_of_poses_on_another_thread_does_not_change_the_torque(tmp_path: Path) -> None:
     model, tilt, theta = model_of(Bench.of("three_joints", tmp_path).arm), Tilt.of("left"), [0.3, 0.5, 0.7]
-    torque = TorqueGuess(model, model.moments, tilt).torque
-    expected, done, interval = torque(theta), threading.Event(), sys.getswitchinterval()
+    torque = TorqueGuess(model).torque
+    expected, done, interval = torque(theta, tilt), threading.Event(), sys.getswitchinterval()
 
     def choose() -> None:
         while not done.is_set():
@@ -268,7 +268,7 @@ def test_the_choice_of_poses_on_another_thread_does_not_change_the_torque(tmp_pa
     thread = threading.Thread(target=choose)
     thread.start()
     try:
-        assert {torque(theta) for _ in range(500)} == {expected}
+        assert {torque(theta, tilt) for _ in range(500)} == {expected}
     finally:
         done.set()
         thread.join()
