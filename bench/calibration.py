@@ -35,9 +35,8 @@ from exo_gravity.core.safety.command import State
 from exo_gravity.core.safety.limits import Limits
 from exo_gravity.lab.calibration.imu import mounting_turn
 from exo_gravity.lab.calibration.moment_model import GRID, MomentModel
-from exo_gravity.lab.calibration.poses import Itinerary
 from exo_gravity.lab.calibration.result import CalibrationResult
-from exo_gravity.lab.calibration.tour import Tour, TourController
+from exo_gravity.lab.calibration.tour import Itinerary, Tour, TourController
 from exo_gravity.lab.calibration.tours import SCALE_POSES, moments_from
 from exo_gravity.lab.calibration.tracking import Observation
 from exo_gravity.lab.inputs.arms import configured_arm

@@ -14,7 +14,7 @@ from exo_gravity.core.compensation.settings import COMPENSATOR, robot_of
 from exo_gravity.core.params import values_of
 from exo_gravity.hardware.urdf_arm import UrdfArm, read_urdf
 from exo_gravity.lab.calibration.moment_model import DescribedModel
-from exo_gravity.lab.calibration.poses import TorqueGuess
+from exo_gravity.lab.calibration.tour import TorqueGuess
 from exo_gravity.lab.inputs.arms import read_arm
 from exo_gravity.lab.inputs.parameter_file import load, packaged_config
 from exo_gravity.lab.inputs.references import pinocchio_model, toolbox_robot

@@ -20,8 +20,9 @@ from exo_gravity.core.compensation.terms.catalogue import Friction
 from exo_gravity.core.compensation.terms.terms import TermSettings
 from exo_gravity.core.motors.joint_motor import JointMotor
 from exo_gravity.core.numbers import Vector
+from exo_gravity.lab.calibration.identification import next_pose
 from exo_gravity.lab.calibration.moment_model import MomentModel
-from exo_gravity.lab.calibration.poses import candidates, hanging, next_pose
+from exo_gravity.lab.calibration.tour import candidates, hanging
 from exo_gravity.lab.calibration.tracking import Observation
 from exo_gravity.lab.calibration.wearer import WEARER, wearer_from
 from exo_gravity.sim import ArmConfig, Firmware, SimulatedArm, SimulatedDevice, SimulatedMotor

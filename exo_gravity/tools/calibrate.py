@@ -127,8 +127,8 @@ def main(args: Sequence[str] | None = None) -> int:
 
 def _run(options: argparse.Namespace) -> int:
     from exo_gravity.lab.calibration.imu import with_mounting
-    from exo_gravity.lab.calibration.live import Person
     from exo_gravity.lab.calibration.result import check_output, page_of, write_changes
+    from exo_gravity.lab.calibration.tours import Person
 
     command: str = options.command
     check_output(options.output)

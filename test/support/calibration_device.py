@@ -21,10 +21,18 @@ from exo_gravity.core.numbers import NO_TORQUE, Vector
 from exo_gravity.core.safety.command import State
 from exo_gravity.core.safety.limits import CAN_BRIDGE, Limits, limits_of
 from exo_gravity.core.safety.machine import SafetyMachine
-from exo_gravity.lab.calibration.live import LiveTour
+from exo_gravity.lab.calibration.identification import next_pose
 from exo_gravity.lab.calibration.moment_model import MomentModel
-from exo_gravity.lab.calibration.poses import Itinerary, next_pose
-from exo_gravity.lab.calibration.tour import Tour, TourController, calibrator_table, line_of, side_of, tour_of
+from exo_gravity.lab.calibration.tour import (
+    Itinerary,
+    Tour,
+    TourController,
+    calibrator_table,
+    line_of,
+    side_of,
+    tour_of,
+)
+from exo_gravity.lab.calibration.tours import LiveTour
 from exo_gravity.lab.calibration.tracking import Observation, Station
 from exo_gravity.lab.inputs.arms import node_values
 from exo_gravity.lab.inputs.parameter_file import load, text_of
@@ -164,7 +172,7 @@ def player_of(nodes: Mapping[str, Any], path: Path, namespace: str = "/right") -
 
 
 def run_tour(options: argparse.Namespace, nodes: Mapping[str, Any], say: object, stopping: object = None) -> LiveTour:
-    """Take the place of `lab.calibration.live.run_tour`, without nodes."""
+    """Take the place of `lab.calibration.tours.run_tour`, without nodes."""
     player = player_of(nodes, options.output.with_suffix(".nodes.yaml"))
     fault, tour = player.play().fault, player.tour
     with options.record.open("a", encoding="utf-8") as file:

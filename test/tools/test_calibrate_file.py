@@ -26,7 +26,7 @@ from exo_gravity.core.arm.paper import ArmModel, gravity_torque
 from exo_gravity.core.arm.tilt import Tilt
 from exo_gravity.core.errors import BusError, DataError, ParameterError
 from exo_gravity.hardware import bus_lock
-from exo_gravity.lab.calibration import identification, live
+from exo_gravity.lab.calibration import identification, tours
 from exo_gravity.lab.calibration.moment_model import MomentModel
 from exo_gravity.lab.calibration.new import turning_joints
 from exo_gravity.lab.calibration.result import CalibrationResult, Change, page_of, remainders, write_changes
@@ -365,7 +365,7 @@ def test_the_motors_are_watched_until_enter_is_pressed_and_without_a_person_the_
     reading, writing = os.pipe()
     shown, watched = io.StringIO(), threading.Event()
     with os.fdopen(reading) as program, os.fdopen(writing, "w", buffering=1) as keys:
-        person = live.Person(Console(file=shown, width=40), program)
+        person = tours.Person(Console(file=shown, width=40), program)
 
         def watch() -> str:
             if not watched.is_set():
@@ -384,7 +384,7 @@ def test_the_motors_are_watched_until_enter_is_pressed_and_without_a_person_the_
 
 
 def test_lines_of_the_calibrator_are_followed_and_observations_are_kept(tmp_path):
-    record, said, tour = tmp_path / "new.jsonl", list[str](), live.LiveTour()
+    record, said, tour = tmp_path / "new.jsonl", list[str](), tours.LiveTour()
     values = {"theta": [0.0] * 4, "direction": [0, 0, 1], "effort": [1.0] * 4, "friction": [0.1] * 4}
     values |= {"spread": [0.01] * 4, "load_mass": 0.0, "load_lever": 0.0, "speed": 0.1}
     for event in ({"progress": "pose 1"}, {"observation": values}, {"trouble": "elbow: a hand"}, {"done": True}):
@@ -404,6 +404,6 @@ def test_no_tour_begins_on_an_arm_that_a_running_bridge_may_carry(tmp_path, monk
     nodes = {BRIDGE: {**bridge, "can.interface": "virtual", "can.channel": channel}}
     before = signal.getsignal(signal.SIGINT)
     with pytest.raises(BusError, match=r"held by /right/can_bridge \(PID 7\)"):
-        live.run_tour(argparse.Namespace(output=tmp_path / "new.yaml", record=None), nodes, print)
+        tours.run_tour(argparse.Namespace(output=tmp_path / "new.yaml", record=None), nodes, print)
     assert signal.getsignal(signal.SIGINT) is before
     lock.release()

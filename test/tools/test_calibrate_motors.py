@@ -16,13 +16,13 @@ import yaml
 
 from exo_gravity.core.errors import DataError
 from exo_gravity.core.motors.ak import MIT, MIT_V3
+from exo_gravity.core.motors.frames import WireFormat
 from exo_gravity.core.motors.joint_motor import JointMotor, channels_of
 from exo_gravity.hardware.bus_lock import BusLock
 from exo_gravity.lab.calibration import motors
-from exo_gravity.lab.calibration.bus_scan import BusScan, MotorAnswer
-from exo_gravity.lab.calibration.live import Person
-from exo_gravity.lab.calibration.motors import HandMotion, MotorSearch, positive_turns
+from exo_gravity.lab.calibration.motors import BusScan, HandMotion, MotorAnswer, MotorSearch, positive_turns
 from exo_gravity.lab.calibration.result import CalibrationResult
+from exo_gravity.lab.calibration.tours import Person
 from exo_gravity.lab.inputs.arms import configured_arm
 from exo_gravity.lab.inputs.parameter_file import packaged_config
 from exo_gravity.sim import Firmware, SimulatedArm, SimulatedDevice, SimulatedMotor
@@ -68,7 +68,7 @@ class Arm(BusScan):
         self.power_up: Iterable[float] | None = None
         self.shaking = 0.0
         self.silent: Collection[int] = ()
-        self.wire_format = MIT.name
+        self.board = MIT
         self.problems: tuple[str, ...] = ()
         self.requests: list[str] = []
         self.said: list[object] = []
@@ -83,7 +83,7 @@ class Arm(BusScan):
         shaken = self.pose + np.array((0.0, 0.0, 0.0, self.shaking * math.sin(20.0 * self._now)))
         angles = dict(zip(self.ids, self.zeros + np.array(self.directions) * shaken, strict=True))
         answering = [i for joint, i in enumerate(self.ids) if i in can_ids and joint not in self.silent]
-        return {i: MotorAnswer(i, i, 8, float(angles[i]), 25, 0, self.wire_format) for i in answering}
+        return {i: MotorAnswer(i, i, 8, float(angles[i]), 25, 0, self.board) for i in answering}
 
     def _move(self, target: Iterable[float], watch: Callable[[], object]) -> None:
         start, end = self.pose, np.array(list(target))
@@ -110,7 +110,7 @@ class Arm(BusScan):
 
     def calibrate(self, folder: Path, pose: tuple[float, ...] = HANGING, **firmware: object) -> CalibrationResult:
         arm = configured_arm(params_of(folder, **firmware), "right")
-        return MotorSearch(self, arm, self.wait, self.said.append, lambda: self._now).result(pose)
+        return MotorSearch([self], arm, self.wait, self.said.append, lambda: self._now).result(pose)
 
 
 @pytest.fixture
@@ -167,12 +167,12 @@ def test_a_jig_gives_the_zero_at_its_own_angles_and_another_position_range_scale
     assert value(result, "zero") == pytest.approx(arm.zeros * (1.0048, 1.0, 1.0, 1.0), abs=0.001)
 
 
-@pytest.mark.parametrize(("wire_format", "is_told"), [(MIT.name, False), (MIT_V3.name, True)])
+@pytest.mark.parametrize(("board", "is_told"), [(MIT, False), (MIT_V3, True)])
 def test_a_board_in_servo_mode_cannot_be_told_from_a_v3_board_and_the_person_is_told_so(
-    arm: Arm, tmp_path: Path, wire_format: str, is_told: bool
+    arm: Arm, tmp_path: Path, board: WireFormat, is_told: bool
 ) -> None:
-    arm.wire_format = wire_format
-    assert value(arm.calibrate(tmp_path), "wire_format") == [wire_format] * 4
+    arm.board = board
+    assert value(arm.calibrate(tmp_path), "wire_format") == [board.name] * 4
     assert (motors.SERVO_MODE in arm.said) is is_told
 
 

@@ -21,10 +21,9 @@ from exo_gravity.core.compensation.settings import robot_of, settings_of
 from exo_gravity.core.errors import DataError
 from exo_gravity.core.numbers import COVER
 from exo_gravity.core.params import values_of
-from exo_gravity.lab.calibration import live, recorded
+from exo_gravity.lab.calibration import recorded, tours
 from exo_gravity.lab.calibration.identification import identify
-from exo_gravity.lab.calibration.poses import Itinerary, friction_stations
-from exo_gravity.lab.calibration.tour import CALIBRATOR, observations_in, tour_of
+from exo_gravity.lab.calibration.tour import CALIBRATOR, Itinerary, friction_stations, observations_in, tour_of
 from exo_gravity.lab.calibration.tours import checked, friction_from, moments_from
 from exo_gravity.lab.calibration.tracking import Observation
 from exo_gravity.lab.calibration.wearer import WornArm, wearer_from
@@ -75,7 +74,7 @@ def test_the_old_torque_scale_and_law_and_gain_of_the_file_are_taken_over_and_an
 
 
 def test_the_calibrator_replaces_the_compensator_and_the_tour_takes_its_parameters():
-    nodes = live.tour_parameters(SIM, ARM, {"tour.poses": 3})
+    nodes = tours.tour_parameters(SIM, ARM, {"tour.poses": 3})
     assert set(nodes) == {"/imu", "/right/can_bridge", "/right/simulator", "/right/calibrator"}
     given = nodes["/right/calibrator"]
     assert given["max_effort"] == list(ARM.limits.max_effort) and given["tour.poses"] == 3
@@ -359,7 +358,7 @@ def left_by_calibration(name: str, folder: Path, run_tool) -> tuple[float, float
 @pytest.mark.thorough
 @pytest.mark.parametrize("name", ["elbow", "three_joints"])
 def test_a_tour_of_a_worn_arm_finds_its_wearer(name, tmp_path, monkeypatch, without_pictures, run_tool) -> None:
-    monkeypatch.setattr(live, "run_tour", run_tour)
+    monkeypatch.setattr(tours, "run_tour", run_tour)
     before, after = left_by_calibration(name, tmp_path, run_tool)
     assert after < LEFT < 0.1 < before
 

@@ -29,11 +29,10 @@ from exo_gravity.core.numbers import Vector
 from exo_gravity.core.trunk.checks import IMU, reported_orientation, reported_vector
 from exo_gravity.hardware.trunk_estimator import ImuSample, TrunkEstimator
 from exo_gravity.lab.calibration.identification import Identified
-from exo_gravity.lab.calibration.live import Say
 from exo_gravity.lab.calibration.moment_model import MomentModel
 from exo_gravity.lab.calibration.recorded import samples_of
 from exo_gravity.lab.calibration.result import CalibrationResult, Change
-from exo_gravity.lab.calibration.tours import model_of
+from exo_gravity.lab.calibration.tours import Say, model_of
 from exo_gravity.lab.calibration.tracking import mean_direction
 from exo_gravity.lab.inputs.arms import ConfiguredArm, node_values
 from exo_gravity.lab.inputs.parameter_file import load

@@ -54,9 +54,7 @@ class MomentModel:
     #: Whether a description says about what the arm weighs and its motors give. The file holds what differs from it:
     #: first moments of the links, and axes that are askew. Else it holds the moments, and a fit begins without such.
     is_described = False
-    worn_along: tuple[int, ...] = (2, 3)  #: moments of a wearer that must each be plausible
     at_least_0: tuple[int, ...] = (0,)  #: moments that are 0 where they seem to be less
-    above_0: tuple[int, ...] = (1, 2, 3)  #: those that must be above 0, and known
     across: tuple[tuple[int, int], ...] = ((7, 3), (6, 2))  #: of one across a link, and of the larger one along it
     rises_from = 2  #: the first link that may not point far upwards
     #: (2, n) rad, lowest and highest angles that are comfortable for a wearer; () if only the limits are known
@@ -95,9 +93,7 @@ class MomentModel:
 
     def rows(self, theta: np.ndarray, direction: np.ndarray) -> np.ndarray:
         """Return the torque (m, n, k) in Nm per kg m at `theta` (m, n) rad. direction: (3,) or (m, 3)."""
-        axes, _, moments = self._turned(theta)
-        pulls = moments @ np.swapaxes(direction @ TURN, 0, -2)  # (m, k, 3), direction x moment
-        return np.asarray(axes @ np.swapaxes(pulls, 1, 2) * self._carried)
+        return np.einsum("mnka,ma->mnk", self.along_axes(theta), np.broadcast_to(direction, (len(theta), 3)))
 
     @cached_property
     def _carried(self) -> np.ndarray:
@@ -217,7 +213,7 @@ class DescribedModel(MomentModel):
 
     is_described = True
     rises_from = 0
-    worn_along = at_least_0 = above_0 = across = comfortable = ()  # a description says enough of its moments
+    at_least_0 = across = comfortable = ()  # a description says enough of its moments
     arm: UrdfArm
 
     def __init__(self, arm: UrdfArm, uses_imu: bool, rotors: Sequence[float] = ()) -> None:

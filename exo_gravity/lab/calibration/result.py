@@ -24,9 +24,8 @@ from matplotlib.figure import Figure
 
 from exo_gravity.core.compensation.settings import joint_spring_of
 from exo_gravity.core.errors import ParameterError
-from exo_gravity.lab.calibration.identification import FrictionCurve, Identified
+from exo_gravity.lab.calibration.identification import FrictionCurve, Identified, columns
 from exo_gravity.lab.calibration.moment_model import MomentModel
-from exo_gravity.lab.calibration.pose_fit import columns
 from exo_gravity.lab.calibration.tracking import Observation
 from exo_gravity.lab.inputs.arms import ConfiguredArm
 from exo_gravity.lab.inputs.parameter_file import load

@@ -2,16 +2,19 @@
 """The tour of a calibration: moves the arm slowly from pose to pose and measures what each of them needs to be held.
 
 Pure: time is an argument. At each pose all joints sweep through it there and back: the mean of both directions is
-gravity, half of the difference is friction. What was measured improves the expected torque, which carries the arm and
-distinguishes a hand on it from its weight. Where motors vibrate the arm moves more slowly; a pose in which a joint
-sticks is left out. The tour begins and ends at the hanging arm; after trouble it withdraws its efforts. Its record has
-one line of JSON for each pose, as `calibrator` prints it.
+gravity, half of the difference is friction. The next pose is a given one, or the most informative one that the motors
+can hold. What holds the arm is expected with a mean and a standard deviation for every pose: by the fit of what this
+tour, and earlier ones, have measured so far. That carries the arm, and distinguishes a hand on it from its weight.
+
+Where motors vibrate the arm moves more slowly; a pose in which a joint sticks is left out. The tour begins and ends at
+the hanging arm; after trouble it withdraws its efforts. Its record has one line of JSON for each pose, as `calibrator`
+prints it.
 """
 
 import json
 import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -23,14 +26,192 @@ from exo_gravity.core.arm.tilt import SIDES, Tilt, angle_between
 from exo_gravity.core.compensation.settings import compensator_table
 from exo_gravity.core.errors import DataError, ExoGravityError
 from exo_gravity.core.motors.joint_motor import MOTOR_PARAMETERS, JointSample
-from exo_gravity.core.numbers import Torque
+from exo_gravity.core.numbers import Torque, Vector
 from exo_gravity.core.params import Param, table_for
 from exo_gravity.core.safety.command import Efforts
-from exo_gravity.core.safety.limits import CAN_BRIDGE, Limits
+from exo_gravity.core.safety.limits import CAN_BRIDGE, WALL, Limits
+from exo_gravity.lab.calibration.identification import EXACT, columns, known_of, layout_of, next_pose, rows_at, solve
 from exo_gravity.lab.calibration.moment_model import MomentModel, model_of
-from exo_gravity.lab.calibration.poses import Itinerary, TorqueGuess, friction_stations
 from exo_gravity.lab.calibration.tracking import MOTION, Line, Observation, Station, Sweep, Tracker, average, followed
 from exo_gravity.sim.controllers import SampleController
+
+
+@dataclass(frozen=True)
+class GuessTuning:
+    """What the expected torque does not explain."""
+
+    unexplained: float = 0.05  #: Nm: standard deviation of what no unknown explains,
+    share: float = 0.03  #: of the torque, in addition: zeros and axes that are off
+
+
+GUESS = GuessTuning()
+
+
+@dataclass(frozen=True)
+class PoseChoice:
+    """Which poses may be visited, and which of them shows most."""
+
+    candidates: int = 800  #: random poses, of which those above the horizontal are left out
+    most_upwards: float = 0.3  #: sine of the largest angle above the horizontal, of links 3 and 4
+    effort_share: float = 0.85  #: of max_effort that a pose may need
+    deviations: float = 2.0  #: of the expected torque, that a pose must leave room for; less where none does
+    least_deviation: float = 1e-9  #: Nm
+    usual_friction: float = 0.5  #: Nm, until it is measured
+    waypoints: int = 4  #: of the way to a pose, at which the motors must hold the arm too
+    first_edge: float = 0.1  #: rad in addition, at the first pose
+    edge: float = 0.02  #: rad between a sweep's end and the soft wall
+
+
+CHOICE = PoseChoice()
+
+
+@dataclass(frozen=True)
+class FrictionSweeps:
+    """The sweeps of the hanging arm that show its friction."""
+
+    speeds: tuple[float, ...] = (0.02, 0.05, 0.1, 0.18, MOTION.speed)  #: rad/s, at which friction is measured
+    time: float = 1.2  #: s of such a sweep's half at steady speed
+    amplitude: tuple[float, float] = (0.05, 0.3)  #: rad, smallest and largest
+
+
+SWEEPS = FrictionSweeps()
+
+
+class TorqueGuess:
+    """The commanded torque that holds the arm, as far as it is known.
+
+    model: of the arm.
+    load: a weight in kg, and its distance from the last joint in m.
+    seen: what this tour and earlier ones of the same arm have shown.
+
+    moments: (k,) kg m, with the weight.
+    """
+
+    def __init__(
+        self, model: MomentModel, load: tuple[float, float] = (0.0, 0.0), seen: Sequence[Observation] = ()
+    ) -> None:
+        self.model, self._load, self._at = model, load, layout_of(model, 0)
+        known = known_of(model, None, False)
+        for part in (self._at.angle, self._at.tilt, self._at.slope):
+            known.error[part] = EXACT
+        self._unknowns, self._covariance = known.start, np.diag(known.error**2)
+        if seen:
+            theta, direction, effort, spread = columns(seen)
+            hung = np.array([model.load(one.load_mass, one.load_lever) for one in seen])
+            rows = rows_at(model, theta, direction)._replace(load=hung)
+            unexplained = np.hypot(GUESS.unexplained, GUESS.share * effort)
+            fit = solve(rows, known, effort, np.hypot(spread, unexplained))
+            self._unknowns, self._covariance = fit.unknowns, fit.covariance
+        self.moments = self._unknowns[self._at.moment] + model.load(*load)
+        self._share = np.exp(-self._unknowns[self._at.scale])  # commanded torque by torque
+        self._arm = model.holding(self.moments)
+        parts = (self._share, self._unknowns[self._at.spring], self._unknowns[self._at.offset])
+        self._joints = list(zip(*(part.tolist() for part in parts), strict=True))
+
+    def torque(self, theta: Sequence[float], tilt: Tilt) -> Torque:
+        """Return the expected torque (n,) in Nm at `theta` (n,) rad, in plain floats for the control loop."""
+        joints = zip(self._arm.torque(theta, tilt), theta, self._joints, strict=True)
+        return tuple([share * (own + k * angle) + offset for own, angle, (share, k, offset) in joints])
+
+    def torques(self, theta: np.ndarray, direction: Vector) -> tuple[np.ndarray, np.ndarray]:
+        """Return the expected torque and its standard deviation, both (m, n) Nm, at `theta` (m, n) rad.
+
+        direction: (3,), gravity's unit vector in the base frame.
+        """
+        rows = rows_at(self.model, theta, np.broadcast_to(direction, (len(theta), 3)))
+        rows = rows._replace(load=rows.load + self.model.load(*self._load))
+        jacobian = rows.jacobian(self._unknowns)
+        variance = np.einsum("mnt,mnt->mn", jacobian @ self._covariance, jacobian)
+        return rows.predicted(self._unknowns), np.sqrt(np.maximum(variance, 0.0))
+
+    def matrix(self, theta: Sequence[float]) -> np.ndarray:
+        """Return the mass matrix (n, n) in kg m^2 of the file's arm, in the torque that each motor is commanded.
+
+        theta: (n,) rad.
+
+        A torque that the joints share in another proportion than their motors give it turns light links against each
+        other: with 1 kg and the arm abducted, joints 1 and 3 together carry 1 kg m^2, but 0.005 against each other.
+        """
+        return self._share[:, None] * self.model.matrix(theta, self._load)
+
+
+@dataclass(frozen=True)
+class Itinerary:
+    """Which stations a tour visits: given ones, then others until so many poses are measured."""
+
+    limits: Limits
+    most: int  #: poses; each that is not given is the one that shows the most
+    given: Sequence[Station] = ()  #: by default the hanging arm
+    again: int = 0  #: of the first poses, visited again at the end, to see whether anything has changed
+
+    @property
+    def count(self) -> int:
+        """How many poses there are."""
+        return max(self.most, len(self.given) or 1) + self.again
+
+    def stations(self, tour: "Tour") -> Iterator[Station]:
+        """Yield each station of a tour when it is due. Raises DataError if no pose can be held."""
+        yield from self.given or [hanging(self.limits)]
+        poses = candidates(self.limits, tour.guess.model)
+        while len(tour.measured) < self.most:
+            room = self._room(poses, tour)
+            if room.max() < 0.0:
+                raise DataError("no further pose can be held within max_effort: is it too small for the arm?")
+            possible = np.flatnonzero(room >= min(CHOICE.deviations, math.floor(room.max())))
+            seen = [one.theta for one in tour.measured] or [hanging(self.limits).theta]
+            index = possible[next_pose(seen, poses[possible], tour.down, tour.guess.moments, tour.guess.model)]
+            yield Station(tuple(poses[index].tolist()))
+            poses = np.delete(poses, index, axis=0)  # chosen once, even if a joint sticks there
+        for one in tour.measured[: self.again]:
+            yield Station(tuple(one.theta))
+
+    def _room(self, poses: np.ndarray, tour: "Tour") -> np.ndarray:
+        """Return the room (m,) that the motors have to hold `poses`, reach them, and leave them for home.
+
+        It is in standard deviations of the expected torque, below 0 where they have none.
+        """
+        shares = np.linspace(0.0, 1.0, CHOICE.waypoints + 1)[1:, None, None]
+        sweep = MOTION.amplitude * np.array((-1.0, 1.0))[:, None, None]
+        there, home = (start + shares * (poses - start) for start in (tour.position, np.array(self.limits.home)))
+        ways = np.vstack((there, poses + sweep, home))
+        mean, deviation = tour.guess.torques(ways.reshape(-1, poses.shape[1]), tour.down)
+        slide = np.where(tour.friction, tour.friction, CHOICE.usual_friction)
+        most = CHOICE.effort_share * np.array(self.limits.max_effort) - slide
+        room = (most - np.abs(mean)) / np.maximum(deviation, CHOICE.least_deviation)
+        return np.asarray(room.min(axis=1).reshape(len(ways), -1).min(axis=0))
+
+
+def hanging(limits: Limits, speed: float = 0.1, amplitude: float = MOTION.amplitude) -> Station:
+    """Return the hanging arm, farther off the soft walls than other poses: friction is not known there at first."""
+    low, high = measurable(limits, amplitude)
+    return Station(
+        tuple(np.clip(limits.home, low + CHOICE.first_edge, high - CHOICE.first_edge).tolist()), speed, amplitude
+    )
+
+
+def friction_stations(limits: Limits) -> list[Station]:
+    """Return sweeps through the hanging arm at each speed; the first lets the controller learn the friction."""
+    speeds = (0.1, *SWEEPS.speeds)
+    amplitudes = np.clip(np.array(speeds) * SWEEPS.time, *SWEEPS.amplitude).tolist()
+    return [hanging(limits, *sweep) for sweep in zip(speeds, amplitudes, strict=True)]
+
+
+def candidates(limits: Limits, model: MomentModel) -> np.ndarray:
+    """Return random poses (m, n) in rad within `limits` in which no link points far upwards.
+
+    Above the shoulder gravity tips the arm over: what is wrong with the expected torque grows with each movement.
+    """
+    low, high = measurable(limits, MOTION.amplitude)
+    poses = np.random.default_rng(1).uniform(low, high, (CHOICE.candidates, model.count))
+    home = float(model.upwards(np.array([limits.home]))[0])  # a link may point upwards in every pose
+    return np.asarray(poses[model.upwards(poses) <= max(CHOICE.most_upwards, home)])
+
+
+def measurable(limits: Limits, amplitude: float) -> tuple[np.ndarray, np.ndarray]:
+    """Return the lowest and highest pose (n,) rad around which a sweep of `amplitude` rad stays off the soft walls."""
+    margin = WALL.width + amplitude + CHOICE.edge
+    return np.array(limits.position_min) + margin, np.array(limits.position_max) - margin
+
 
 # Share of the expected torque that a hanging arm gets until it is carried. With more torque than its weight needs, it
 # tips over: with 1 kg, and motors 17 % stronger than the file says, it swung out to 0.9 rad before the tour began.
@@ -54,7 +235,6 @@ MAX_GAP = 0.1  # s between two joint states; as long as can_bridge's longest tim
 LONGEST_CHOICE = 30.0  # s for which the arm is held while the next pose is chosen
 MAX_TILT = 0.1  # rad by which the stand or the trunk may tilt during the tour
 HAND = "a hand is on the arm, or the joint is blocked"
-HELD = "is a hand on the arm?"
 VIBRATED = (
     "motors vibrated, as behind elastic joints, and the gains that stop this are too low for this file: correct "
     "its masses and torque_scale, hang no weight, or stiffen the joint"
@@ -69,8 +249,10 @@ class Tour:
     rate: of joint states, Hz. load: a weight in kg, and its distance from the last joint in m.
 
     measured: so far. trouble: why it ended early, as a sentence that names joint, value and limit, or ''. done: whether
-    the arm hangs again after the last pose. progress: what it does, as a sentence. elapsed: s since the first step.
+    the arm hangs again after the last pose. progress: what it does, as a sentence.
     temperature: (n,) degC of the motors, set by who knows it; () if it is not known.
+    guess: of the torque that holds the arm, by `plan`. position: (n,) rad, at the end of the present line.
+    down: (3,), gravity's unit vector in the base frame. friction: (n,) Nm, 0 until it is measured.
     """
 
     def __init__(
@@ -86,27 +268,25 @@ class Tour:
         self.trouble = ""
         self.done = False
         self.progress = "choosing the first pose"
-        self.elapsed = 0.0
         self.temperature: Sequence[float] = ()
         self._limits, self._most = limits, np.array(limits.max_effort)
-        self._itinerary, self._load, self._earlier = itinerary, load, earlier
-        self._guess = TorqueGuess(model, load, earlier)
+        self.itinerary, self._load, self._earlier = itinerary, load, earlier
+        self._stations = itinerary.stations(self)
+        self.guess = self._acting = TorqueGuess(model, load, earlier)
         self._tracker = Tracker(rate, limits.max_effort)
         self._first_tilt = self._tilt = Tilt.of(SIDES[0])
         self._now = -math.inf
-        self._position = np.zeros(model.count)  # rad, at the end of the present line
+        self.position = self.friction = np.zeros(model.count)
         self._left_out: list[str] = []  # why, of each pose
         self._awaits_plan, self._undecided = False, 0.0  # whether a pose is to be chosen, and s since then
         self._plan: tuple[Station | None, str] = (None, "")  # the next pose, or None to go home, and the trouble
-        self._next_guess = self._guess
-        self._friction = np.zeros(model.count)  # Nm, 0 until it is measured
         self._unexplained = np.zeros(model.count)  # s
         self._refreshed = -math.inf
         self._matrix, self._uncertain = np.eye(model.count), np.zeros(model.count)
 
     def wait(self, position: Sequence[float], tilt: Tilt) -> Torque:
         """Return the effort (n,) in Nm at `position` (n,) rad, while the arm is not yet carried: it goes on hanging."""
-        return tuple(WAITING_SHARE * torque for torque in self._guess.torque(position, tilt))
+        return tuple(WAITING_SHARE * torque for torque in self._acting.torque(position, tilt))
 
     def step(self, now: float, position: Sequence[float], velocity: Sequence[float], tilt: Tilt) -> Torque | None:
         """Return the effort (n,) in Nm at `now` s, None after trouble.
@@ -115,21 +295,19 @@ class Tour:
         """
         if self.trouble:
             return None
-        self._tilt, expected = tilt, self._guess.torque(position, tilt)
+        self._tilt, expected = tilt, self._acting.torque(position, tilt)
         if self.done:  # the bridge lets the arm down: it is no longer watched
             return tuple(np.clip(expected + self._tracker.correction, -self._most, self._most).tolist())
         if self._now == -math.inf:
-            self._first_tilt, self._now, self._position = tilt, now, np.array(position)
+            self._first_tilt, self._now, self.position = tilt, now, np.array(position)
             self._tracker.lines = self._lines()
             self._tracker.shift((1.0 - WAITING_SHARE) * np.array(expected))
         dt, self._now = now - self._now, now
-        self.elapsed += dt
         self._undecided = self._undecided + dt if self._awaits_plan else 0.0
-        down = self._guess.model.down(tilt)
         if now - self._refreshed > REFRESH_PERIOD:
-            self._refreshed, self._matrix = now, self._guess.matrix(position)
-            self._uncertain = self._guess.torques(np.array([position]), down)[1][0]
-        effort = self._tracker.step(dt, position, velocity, expected, down, self._matrix)
+            self._refreshed, self._matrix = now, self._acting.matrix(position)
+            self._uncertain = self._acting.torques(np.array([position]), self.down)[1][0]
+        effort = self._tracker.step(dt, position, velocity, expected, self.down, self._matrix)
         self.trouble = self.trouble or self._wrong_motion(dt, tilt) or self._wrong_torque(dt)
         return None if self.trouble else effort
 
@@ -157,13 +335,18 @@ class Tour:
         for i in np.flatnonzero(self._tracker.saturated > SATURATION):
             most = f"max_effort = {self._most[i]:g} Nm"
             return f"{self._limits.joint_names[i]}: saturated: the pose needs more than {most}{self._because()}"
-        torque, slide = self._tracker.correction, np.where(self._friction, 0.5 * self._friction, UNKNOWN_FRICTION)
+        torque, slide = self._tracker.correction, np.where(self.friction, 0.5 * self.friction, UNKNOWN_FRICTION)
         limit = MAX_CORRECTION * self._softness + DEVIATIONS * self._uncertain + slide
         self._unexplained = np.where(np.abs(torque) > limit, self._unexplained + dt, 0.0)
         for i in np.flatnonzero(self._unexplained > PERSISTENCE):
             beyond = f"{torque[i]:.2f} Nm beyond its weight and friction, the limit is {limit[i]:.2f}"
-            return f"{self._limits.joint_names[i]}: {beyond}{self._because(HELD)}"
+            return f"{self._limits.joint_names[i]}: {beyond}{self._because('is a hand on the arm?')}"
         return ""
+
+    @property
+    def down(self) -> np.ndarray:
+        """Gravity's unit vector (3,) in the base frame."""
+        return self.guess.model.down(self._tilt)
 
     @property
     def _softness(self) -> float:
@@ -185,12 +368,9 @@ class Tour:
         if not self._awaits_plan:
             return
         try:
-            model = self._guess.model
-            self._next_guess = guess = TorqueGuess(model, self._load, [*self._earlier, *self.measured])
-            taken = np.array([measured.theta for measured in self.measured]).reshape(-1, model.count)
-            state = taken, self._position, guess, model.down(self._tilt), self._friction
+            self.guess = TorqueGuess(self.guess.model, self._load, [*self._earlier, *self.measured])
             is_over = len(self._left_out) > MAX_LEFT_OUT
-            self._plan = None if is_over else self._itinerary.next(*state), ""
+            self._plan = None if is_over else next(self._stations, None), ""
         except ExoGravityError as error:
             self._plan = (None, str(error))
         except Exception as error:
@@ -203,21 +383,20 @@ class Tour:
         while True:
             self._awaits_plan = True
             while self._awaits_plan:
-                yield Line(self._position, self._position)
-            here, before = self._position.tolist(), self._guess
-            station, self.trouble = self._plan
-            self._guess = self._next_guess
-            self._tracker.shift(np.subtract(self._guess.torque(here, self._tilt), before.torque(here, self._tilt)))
+                yield Line(self.position, self.position)
+            before, after = (one.torque(self.position.tolist(), self._tilt) for one in (self._acting, self.guess))
+            self._tracker.shift(np.subtract(after, before))
+            self._acting, (station, self.trouble) = self.guess, self._plan
             if station is None:
                 break
             angles = " ".join(f"{math.degrees(angle):.0f}" for angle in station.theta)
             left_out = "".join(f"; left out: {why}" for why in self._left_out[-1:])
-            self.progress = f"pose {len(self.measured) + 1} of {self._itinerary.count}: {angles} deg{left_out}"
-            start, self._position = self._position, station.ends[0]
-            yield Line(start, self._position)
+            self.progress = f"pose {len(self.measured) + 1} of {self.itinerary.count}: {angles} deg{left_out}"
+            start, self.position = self.position, station.ends[0]
+            yield Line(start, self.position)
             yield from self._sweeps(station)
         self.progress = "back to the hanging arm"
-        yield Line(self._position, home)
+        yield Line(self.position, home)
         self.done, self.progress = True, "done"
         yield Line(home, home)
 
@@ -231,11 +410,11 @@ class Tour:
                 # Sweep again: neither friction nor gravity shows while motors vibrate.
                 sweeps = []
                 continue
-            share, was_known = followed(pair, station), bool(np.any(self._friction))
+            share, was_known = followed(pair, station), bool(np.any(self.friction))
             sticks = bool(np.min(share) < MOTION.followed)
             if station.speed >= STEADY_SPEED:
-                self._friction = np.maximum(average(pair)[0].friction, self._friction if sticks else 0.0)
-                self._tracker.friction = self._friction
+                self.friction = np.maximum(average(pair)[0].friction, self.friction if sticks else 0.0)
+                self._tracker.friction = self.friction
             # Sweep again what passed without friction, or what a joint did not follow.
             sweeps = [] if sticks or not was_known else sweeps + pair
             failures += sticks
@@ -250,7 +429,7 @@ class Tour:
         """Keep what the `sweeps` show, and improve the expected torque with it, unless the passes differ."""
         seen, unrest = average(sweeps)
         theta = np.asarray(seen.theta)
-        effort = seen.effort + self._guess.torques(theta[None], seen.direction)[0][0]
+        effort = seen.effort + self._acting.torques(theta[None], seen.direction)[0][0]
         allowed = np.dot(MAX_UNREST, (np.ones(len(effort)), np.abs(seen.friction), np.abs(effort)))
         for name, change, limit in zip(self._limits.joint_names, unrest, allowed, strict=True):
             if change > limit:
@@ -258,8 +437,8 @@ class Tour:
                 self.trouble = f"{name}: {what}: the arm was touched, or the joint slips"
                 return
         weight, lever = self._load
-        seen = seen._replace(effort=effort, load_mass=weight, load_lever=lever)
-        self.measured.append(seen._replace(speed=station.speed, temperature=tuple(self.temperature)))
+        kept = seen._replace(effort=effort, load_mass=weight, load_lever=lever, speed=station.speed)
+        self.measured.append(kept._replace(temperature=tuple(self.temperature)))
 
 
 class TourController(SampleController):

@@ -1,10 +1,10 @@
 # Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
 """calibrate wearer: what a relaxed wearer's arm adds to a calibrated robot, from a slow tour or a recording.
 
-The fit is that of the robot (`pose_fit.solve`), with other things known before: the robot's moments and torque scales
-are exact, the moments of the wearer's arm those of the body-mass table, widely. Relaxed joints have springs, which stay
-where the poses ask for them. What neither explains, such as a shoulder that rises with the arm, widens the error of
-the torque. Two more moments, which grow with elevation, were tried: ten poses do not tell them from springs.
+The fit is that of the robot (`identification.solve`), with other things known before: the robot's moments and torque
+scales are exact, the moments of the wearer's arm those of the body-mass table, widely. Relaxed joints have springs,
+which stay where the poses ask for them. What neither explains, such as a shoulder that rises with the arm, widens the
+error of the torque. Two more moments, which grow with elevation, were tried: ten poses do not tell them from springs.
 
 What varies of the wearer's own activity shows when a pose is visited again. What does not vary is not visible: a person
 who carries a constant share of their arm looks like one with a lighter arm.
@@ -22,11 +22,9 @@ from exo_gravity.core.arm.wearer import MAX_TISSUE, TISSUE_REACH
 from exo_gravity.core.compensation.settings import joint_spring_of, wearer_of
 from exo_gravity.core.errors import DataError, ParameterError
 from exo_gravity.core.numbers import COVER, for_joints, one_float
-from exo_gravity.lab.calibration.held import held
-from exo_gravity.lab.calibration.live import Say
-from exo_gravity.lab.calibration.pose_fit import EXACT, Known, columns, layout_of, rows_at, with_springs
+from exo_gravity.lab.calibration.identification import EXACT, Known, columns, held, layout_of, rows_at, with_springs
 from exo_gravity.lab.calibration.result import CalibrationResult, Change
-from exo_gravity.lab.calibration.tours import at_links, exact_law, model_of, row, torque_error, tour_observations
+from exo_gravity.lab.calibration.tours import Say, at_links, exact_law, model_of, row, torque_error, tour_observations
 from exo_gravity.lab.calibration.tracking import Observation
 from exo_gravity.lab.inputs.arms import ConfiguredArm
 

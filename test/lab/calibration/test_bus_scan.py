@@ -17,7 +17,7 @@ from exo_gravity.core.motors.frames import DAMPED, ENTER, SET_ZERO, unpack_comma
 from exo_gravity.core.motors.joint_motor import JointMotor
 from exo_gravity.hardware import bus_lock
 from exo_gravity.hardware.bus_lock import BusLock
-from exo_gravity.lab.calibration.bus_scan import BusScan
+from exo_gravity.lab.calibration.motors import BusScan
 from exo_gravity.sim import Firmware, SimulatedArm, SimulatedDevice
 from exo_gravity.sim.motors import simulated
 from exo_gravity.sim.virtual_time import Wire
@@ -89,7 +89,7 @@ def test_the_motors_of_all_families_are_found_and_none_is_commanded(wire: Wire, 
         answers, problems = bus.scan(range(1, 20))
         polled = bus.poll((1, 2, 3, 8))
     assert problems == ()
-    found = {answer.can_id: (answer.family, answer.wire_format, answer.reply_id) for answer in answers}
+    found = {answer.can_id: (answer.board.family, answer.board.name, answer.reply_id) for answer in answers}
     assert found == {
         1: ("damiao", "mit", 0x11),
         2: ("ak", "mit", 2),
@@ -200,7 +200,7 @@ def test_motors_of_both_formats_are_found_on_one_bus_and_the_v3_boards_are_sent_
         answers, problems = bus.scan(range(1, 7))
         polled = bus.poll((1, 2, 3, 4))
     assert problems == ()
-    assert [(answer.can_id, answer.wire_format) for answer in answers] == [
+    assert [(answer.can_id, answer.board.name) for answer in answers] == [
         (1, "mit"), (2, "mit_v3"), (3, "mit"), (4, "mit_v3"),
     ]  # fmt: skip
     assert [answer.position for answer in answers] == pytest.approx([0.5, -0.2, 1.0, 0.3], abs=0.02)

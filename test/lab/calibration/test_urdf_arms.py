@@ -18,13 +18,12 @@ import pytest
 from exo_gravity.core.arm.tilt import Tilt, gravity_in_trunk
 from exo_gravity.core.errors import DataError, ParameterError
 from exo_gravity.hardware.urdf_arm import MOMENT_NAMES, TURN_NAMES, UrdfArm
-from exo_gravity.lab.calibration.identification import identify
-from exo_gravity.lab.calibration.live import tour_parameters
+from exo_gravity.lab.calibration.identification import identify, next_pose
 from exo_gravity.lab.calibration.moment_model import DescribedModel
 from exo_gravity.lab.calibration.moment_model import model_of as moments_of_values
-from exo_gravity.lab.calibration.poses import TorqueGuess, candidates, next_pose
 from exo_gravity.lab.calibration.result import CalibrationResult, page_of, write_changes
-from exo_gravity.lab.calibration.tours import friction_from, model_of, moments_from
+from exo_gravity.lab.calibration.tour import TorqueGuess, candidates
+from exo_gravity.lab.calibration.tours import friction_from, model_of, moments_from, tour_parameters
 from exo_gravity.lab.calibration.tracking import Observation
 from exo_gravity.lab.calibration.wearer import WEARER, WornArm, wearer_from
 from exo_gravity.lab.inputs.arms import ConfiguredArm, configured_arm, read_arm
@@ -232,7 +231,7 @@ def test_two_leans_of_the_base_show_how_the_imu_is_mounted(tmp_path: Path) -> No
             "elbow",
             0.0,
             lambda seen: [one._replace(effort=-np.asarray(one.effort)) for one in seen],
-            r"joint 1 needs -.* times the torque of the URDF: must be from 0\.3 to 3",
+            r"joint 1 needs -.* times the torque of the file: must be from 0\.3 to 3",
         ),
         ("three_joints", 0.0, lambda seen: seen[:1] * 4, r"4 poses do not show abduction 2.*: add the pose \["),
     ],
