@@ -75,8 +75,7 @@ class Fit:
     least_spread: float = 0.003  #: Nm; about half a code of an AK motor's 12-bit torque
     share: float = 0.4  #: of a moment: masses and torque scales that are each off by 30 %
     moment: float = 0.02  #: kg m, in addition: off-axis moments of which the file knows nothing
-    scale: float = 0.3  #: of a torque scale,
-    described_scale: float = 0.15  #: and of an arm whose masses are known; users report 0.75
+    scale: float = 0.3  #: of a torque scale; users report 0.75
     offset: float = 0.3  #: Nm
     beside: float = 0.05  #: rad, by which a known weight may lie beside its link; 3 degrees
     #: rad about each axis, of gravity's measured direction: an IMU's mounting, mostly its heading
@@ -162,8 +161,7 @@ def known_of(model: MomentModel, places: Places | None, is_relative: bool) -> Kn
     start[at.moment] = model.moments
     least[at.spring] = least[list(model.at_least_0)] = 0.0
     error[at.moment] = FIT.share * np.abs(model.moments) + FIT.moment
-    error[at.scale] = FIT.described_scale if model.is_described else FIT.scale
-    error[at.offset], error[at.angle] = FIT.offset, FIT.beside
+    error[at.scale], error[at.offset], error[at.angle] = FIT.scale, FIT.offset, FIT.beside
     error[at.tilt] = FIT.tilt if model.shows_tilt else EXACT
     error[at.spring], error[at.slope] = FIT.spring, FIT.slope
     if places:
@@ -538,7 +536,7 @@ class Identified:
     slope_error: np.ndarray  #: (n,), standard errors, 0 where no slope was fitted
     temperature: np.ndarray  #: (n,) degC, mean of the motors, at which `scale` is true; NaN where not known
     #: (n, 3) rad by which the joints' places are turned: about the axis, by which a joint is farther than its encoder
-    #: says, and about two directions across it; (0, 3) if they are not identified
+    #: says, and about two directions across it
     turn: np.ndarray
     turn_error: np.ndarray  #: likewise, standard errors
     in_file: np.ndarray  #: (k,) kg m, the moments with which a parameter file holds the arm best
@@ -603,10 +601,8 @@ def identify(observations: Sequence[Observation], model: MomentModel, places: Pl
 
 def _check_known(hidden: np.ndarray, count: int, direction: Vector, model: MomentModel) -> None:
     """Raise DataError that names what is missing if `count` poses do not show `hidden` (count,) that others would."""
-    at = layout_of(model)
-    shown = model.upright  # what shows while the base leans needs no pose
-    needed = np.concatenate((shown.any(axis=0), *(shown.any(axis=1),) * 2))
-    missing = hidden[: at.offset.stop] & shown_by(model, model.suggested, direction) & needed
+    upright = model.down(Tilt.of(SIDES[0]))  # what shows only while the base leans needs no pose
+    missing = hidden[: layout_of(model).offset.stop] & shown_by(model, model.suggested, upright)
     if np.any(missing):
         names = ", ".join(name for name, is_missing in zip(_names(model), missing, strict=False) if is_missing)
         pose = missing_pose(missing, direction, model)

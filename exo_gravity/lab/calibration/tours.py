@@ -355,9 +355,7 @@ def exact_law(arm: ConfiguredArm) -> Iterator[Change]:
 
 
 def _zero_changes(arm: ConfiguredArm, found: Identified) -> Iterator[Change]:
-    """Yield the zeros of the encoders, where they were identified."""
-    if not len(found.turn):
-        return
+    """Yield the zeros of the encoders."""
     bridge, (degrees, error) = arm.can_bridge, np.degrees((found.turn[:, 0], found.turn_error[:, 0]))
     zero = np.array(bridge["zero"]) - np.array(bridge["direction"]) * found.turn[:, 0]
     # A zero that no pose shows keeps the value of the file, and its error means nothing.
@@ -386,8 +384,7 @@ def _spring_changes(arm: ConfiguredArm, found: Identified) -> Iterator[Change]:
     node, before = f"{arm.namespace}/compensator", joint_spring_of(arm.compensator)
     if not (np.any(found.stiffness) or before.on):
         return
-    rest = found.rest + (found.turn[:, 0] if len(found.turn) else 0.0)
-    new = Springs(found.stiffness.round(4).tolist(), rest.round(4).tolist())
+    new = Springs(found.stiffness.round(4).tolist(), (found.rest + found.turn[:, 0]).round(4).tolist())
     note = f"Nm/rad, +-{row(found.stiffness_error)}; 0: the poses show none"
     yield Change(node, "joint_spring.stiffness", list(new.stiffness), note)
     yield Change(node, "joint_spring.rest", list(new.rest), "rad, with the offset of the motor")

@@ -58,7 +58,7 @@ export class Sections {
 
   fill(settings) {
     const fields = this.form.elements;
-    fields.body_mass.value = settings["wearer.body_mass"] || ""; // 0: none
+    fields.body_mass.value = settings["wearer.body_mass"];
     fields.sex.value = settings["wearer.sex"];
     LENGTHS.forEach((name, n) => (fields[name].value = Math.round(1000 * settings["wearer.segment_length"][n]) / 10));
   }
@@ -92,8 +92,7 @@ export class Sections {
   show(state, operates) {
     const running = ["running", "reporting"].includes(state.trial.phase);
     for (const id of ["save"]) byId(id).disabled = !operates;
-    const cards = [...this.cards.values()];
-    byId("trial-start").disabled = !operates || running || !cards.every((card) => card.state === "active");
+    byId("trial-start").disabled = !operates || running;
     byId("trial-stop").disabled = !operates || state.trial.phase !== "running";
     byId("record").disabled = !operates || state.recording.on || state.recording.foreign;
     byId("record-stop").disabled = !operates || !state.recording.on || running;
@@ -101,7 +100,7 @@ export class Sections {
     write(byId("recording-text"), recordingText(state.recording));
     write(byId("saved"), state.saved ? t("saved", state.saved) : "");
     this.showTrial(state.trial);
-    const isOff = cards.every((card) => OFF.includes(card.state));
+    const isOff = [...this.cards.values()].every((card) => OFF.includes(card.state));
     this.markers.show(state.recording, isOff);
     if (state.session) this.session.show(state, operates, isOff);
   }
@@ -109,7 +108,7 @@ export class Sections {
   showTrial(trial) {
     const step = trial.steps?.[trial.step];
     write(byId("trial-text"), trialText(trial));
-    write(byId("trial-step"), trial.phase === "running" && step ? stepText(step, this.cards.values().next().value) : "");
+    write(byId("trial-step"), trial.phase === "running" && step ? stepText(step) : "");
     const report = byId("trial-report");
     report.hidden = !trial.report;
     if (trial.report) report.href = fileAt("report", trial.report);
@@ -215,8 +214,7 @@ class Session {
   show(state, operates, isOff) {
     const { recording, session, trial } = state;
     for (const control of this.form.elements) control.disabled = !operates || !isOff;
-    const [first] = this.sections.cards.values();
-    byId("keep-wearer").disabled = !operates || !session.subject || first?.setup?.settings["wearer.body_mass"] === 0;
+    byId("keep-wearer").disabled = !operates || !session.subject;
     byId("past-filter").disabled = !isOff;
     for (const button of byId("past").querySelectorAll("button")) button.disabled = !operates || !isOff;
     const present = JSON.stringify(session);
@@ -288,9 +286,7 @@ function trialText(trial) {
   return t(`trial.${trial.phase}`, trial.name);
 }
 
-// card: of an arm, whose joints a pose names.
-function stepText({ action, value }, card) {
-  if (action === "load") return value[0] ? t("step.load", number(value[0], 1)) : t("step.unload");
-  const angles = value.map(degrees);
-  return t(`step.${action}`, action === "move" ? card.poseText(angles) : number(angles[0], 0));
+function stepText(step) {
+  const kilograms = step.action === "load";
+  return t(`step.${step.action}`, step.value.map((value) => (kilograms ? number(value, 1) : number(degrees(value), 0))).join("° "));
 }
