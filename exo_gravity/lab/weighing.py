@@ -190,7 +190,7 @@ class Weighing:
         self._lever = np.array(s.unit_load.torque(theta, tilt))  # dz/dq, m
         fastest = max(map(abs, velocity))
         if np.linalg.norm(self._lever) < WEIGHING.least_lever:
-            pose = "bend the elbow to a right angle, or raise the arm to the side"
+            pose = "bend the elbow by 45 degrees"
             self.trouble = Reason(
                 WeighingTrouble.HANGS_DOWN, f"the hand hangs below the joints, where a load needs no torque: {pose}"
             )

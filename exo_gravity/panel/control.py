@@ -74,7 +74,18 @@ def setup_of(nodes: Mapping[str, tuple[Values, Values]]) -> dict[str, Any]:
         picture = urdf([described(*both[::-1]) for both in nodes.values() if all(both)])
     except (ExoGravityError, KeyError):
         picture = None
-    return {"arms": {arm: _arm_setup(*both) for arm, both in nodes.items()}, "urdf": picture}
+    arms = {}
+    for arm, (bridge, compensator) in nodes.items():
+        efforts = [values["max_effort"] for values in (bridge, compensator) if values.get("max_effort")]
+        # With a URDF, 0 of the compensator stands for the limit in it.
+        # Nodes of arms with different joints, which do not work together, may be in one namespace.
+        given = [[limit for limit in column if limit > 0.0] for column in zip(*efforts, strict=False)]
+        arms[arm] = {
+            "max_effort": [min(column, default=None) for column in given] if given else None,
+            "settings": {name: compensator.get(name) for name in SETTABLE},
+            "source": source_of(bridge, False).value,
+        }
+    return {"arms": arms, "urdf": picture}
 
 
 class LoadChanges:
@@ -120,18 +131,6 @@ def difference(before: Values, load: Values) -> dict[str, Any] | None:
     if what in ("", "wearer"):
         return {"what": what} if what else None
     return {"what": what, "from": before[name], "to": load[name]}
-
-
-def _arm_setup(bridge: Values, compensator: Values) -> dict[str, Any]:
-    efforts = [values["max_effort"] for values in (bridge, compensator) if values.get("max_effort")]
-    # With a URDF, 0 of the compensator stands for the limit in it.
-    # Nodes of arms with different joints, which do not work together, may be in one namespace.
-    given = [[limit for limit in column if limit > 0.0] for column in zip(*efforts, strict=False)]
-    return {
-        "max_effort": [min(column, default=None) for column in given] if given else None,
-        "settings": {name: compensator.get(name) for name in SETTABLE},
-        "source": source_of(bridge, False).value,
-    }
 
 
 # What a page may ask for in "do", and the other keys of each request.

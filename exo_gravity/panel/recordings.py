@@ -217,6 +217,8 @@ class Recordings:
         in_force: dict[str, Any] = next((values for node, values in nodes if node.endswith("/compensator")), {})
         if not self._present["subject"] or not in_force:
             return "no subject is chosen" if in_force else "no arm has been found yet"
+        if in_force.get("wearer.body_mass") == 0.0:
+            return "no wearer has been entered"
         wearer = {name: in_force[name] for name in OF_SUBJECT if name in in_force}
         folder = self._output / self._present["subject"]
         folder.mkdir(parents=True, exist_ok=True)

@@ -12,7 +12,6 @@ use, or part of a recording could not be read; the rest is reported first.
 import argparse
 import math
 import os
-import time
 from collections.abc import Callable, Iterable, Sequence
 from functools import partial
 from glob import glob
@@ -92,7 +91,7 @@ def _run(options: argparse.Namespace) -> int:
     )
     given = {name: value for name in ("width", "font") if (value := getattr(options, name))}
     on_paper = html.Print(options.figures, **given)
-    (path, *more), screen, began = options.bag, Console(stderr=True), time.time() - 0.1  # a file's time is coarse
+    (path, *more), screen = options.bag, Console(stderr=True)
     beside = path.resolve().with_name(f"{path.resolve().stem}_report")
     if more or options.scheduler or (path.is_dir() and cohort.recordings_below(path) not in ([], [path])):
         return _run_cohort(options, criteria, on_paper, Path(options.output or beside))
@@ -101,26 +100,27 @@ def _run(options: argparse.Namespace) -> int:
         bag = read_bag(path, options.decimate)
     report = trial_report.analyse(bag, criteria, options.min_hold)
     output, part = Path(options.output or beside), Part(options.joints, options.start, options.end)
-    _export(options, output, lambda: [bag])
-    written = trial_report.write(report, output, on_paper, part)
+    written = sorted([*_export(options, output, lambda: [bag]), *trial_report.write(report, output, on_paper, part)])
     if clip:
         clip.write(bag, screen)
     trial_report.print_report(report)
-    print(f"Written: {', '.join(path.name for path in written if path.stat().st_mtime > began)} in {output}")
+    print(f"Written: {', '.join(path.name for path in written)} in {output}")
     return report.exit_code
 
 
-def _export(options: argparse.Namespace, output: Path, bags: Callable[[], Iterable[Bag]]) -> None:
-    """Write what other programs read. bags: returns the recordings, of which one at a time is in memory."""
-    if not (options.csv or options.parquet or options.lerobot):
-        return
+def _export(options: argparse.Namespace, output: Path, bags: Callable[[], Iterable[Bag]]) -> list[Path]:
+    """Write what other programs read; return the tables. bags: returns the recordings, one at a time in memory."""
+    tables = [output / f"time_series.{kind}" for kind in ("csv", "parquet") if getattr(options, kind)]
+    if not (tables or options.lerobot):
+        return []
     from exo_gravity.lab.report.export import write_lerobot, write_time_series
 
     output.mkdir(parents=True, exist_ok=True)
-    for suffix in (".csv",) * options.csv + (".parquet",) * options.parquet:
-        write_time_series(output / f"time_series{suffix}", bags())
+    for path in tables:
+        write_time_series(path, bags())
     if options.lerobot:
         write_lerobot(output / "lerobot", bags(), options.lerobot)
+    return tables
 
 
 def _run_cohort(options: argparse.Namespace, criteria: HoldCriteria, on_paper: html.Print, output: Path) -> int:

@@ -468,6 +468,7 @@ def test_a_lower_bound_holds_for_the_efforts_that_are_followed_already_and_with_
     bound, torque, state
 ):
     loop = OuterLoop()
+    assert AssistInput(NAMES).reason.word == "off"  # before the first message, too
     loop.input.assist, loop.efforts = Assist((10.0,) * 4), (5.0, -5.0, 0.0, 0.0)
     loop.run(2.0)
     loop.input.assist, loop.sending = Assist((bound,) * 4), False

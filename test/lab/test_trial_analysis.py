@@ -166,6 +166,19 @@ JUDGED = {  # a recording, the kinds of its motions, and what is said of an arm 
     "it falls, then hangs still": (released(np.zeros(4)), [], "from where it was let go"),
     "it slips a little": (slipped(0.4, 0.1), ["slip"], ""),
     "it slips": (slipped(1.5, 0.2), ["slip"], "slipped by 1.5"),
+    "it gives way to a load": (
+        replace(
+            slipped(1.5, 0.2),
+            steps=(
+                SCRIPT[0],
+                ScriptedStep("hold", 2.0, 7.0),
+                ScriptedStep("load", 7.0, 7.2),
+                ScriptedStep("hold", 7.2, 12.0),
+            ),
+        ),
+        ["load"],
+        "gave way to a change of load by 1.5",
+    ),
     "let down in a hold": (carried_until(17.0, STOPPED_IN_A_HOLD), ["let down"], ""),
     "fallen in a hold": (carried_until(26.0, STOPPED_IN_A_HOLD), ["slip"], "slipped"),
     "never carried": (recording(still(HANGING, 10.0), carried=()), [], "right: the arm was never carried"),

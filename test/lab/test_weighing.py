@@ -101,7 +101,7 @@ def test_a_client_gets_2_nm_and_what_5_kg_need_until_the_settings_change():
 
 
 TROUBLE = {  # the arm's poses, its velocity, and what is said of it
-    "hanging": ([HANGING], STILL, "bend the elbow to a right angle"),
+    "hanging": ([HANGING], STILL, "bend the elbow by 45 degrees"),
     "moving": ([POSE], (0.0, 0.0, 0.5, 0.0), r"the arm moves at 0\.50 rad/s: hold it still"),
     "held, or not carried": ([POSE] * 3000, STILL, "does not follow|a hand on the arm"),
     "its load falls": ([POSE, (0.0, 0.2, 0.0, 1.3)], STILL, r"was the load dropped\?"),

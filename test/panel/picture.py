@@ -41,12 +41,9 @@ def _shoot(browser: Browser, stage: Stage, name: str, width: int, height: int) -
     wait_for_state(page, stage.arms.states["left"], "left")
     page.wait_for_selector("[data-arm=right] .mark:not([hidden])", state="attached")
     page.wait_for_timeout(8000)
-    if page.is_visible("#take"):  # the page before this one held control, and is gone
-        page.click("#take")
-        page.wait_for_selector("#release:visible")
-        page.evaluate("scrollTo(0, 0)")
     page.screenshot(path=ROOT / "docs" / f"{name}.png")
     page.context.close()
+    stage.control.holder = None  # the next page holds control
 
 
 if __name__ == "__main__":

@@ -364,6 +364,8 @@ def test_what_belongs_to_the_wearer_is_kept_in_a_file_and_read_again_with_the_su
     assert kept.ask("keep_wearer")
     kept.begin("P01")
     assert kept.state()["session"]["wearer"] == {} and kept.ask("keep_wearer") == ""
+    kept.device.parameters.return_value = {"/right/compensator": {**COMPENSATOR, "wearer.body_mass": 0.0}}
+    assert kept.ask("keep_wearer") == "no wearer has been entered"
     for subject, wearer in (("P02", {}), ("P01", WEARER_FILE), ("P02", {})):
         kept.begin(subject)
         assert kept.state()["session"]["wearer"] == wearer
@@ -464,7 +466,7 @@ TEXTS = CONTENT["texts"]
 WORDS = {  # of the nodes, that an operator must understand
     "fault": FaultCode, "do": FaultCode, "state": [state.value for state in State], "step": (*TIMED, *VALUED),
     "sentence": [state.value for state in State], "wait": vocabulary.Wait, "reason": vocabulary.Withdrawal,
-    "trouble": beside.WeighingTrouble, "source": vocabulary.Source, "marker": MARKERS,
+    "trouble": (*beside.WeighingTrouble, *beside.WeighingRefused), "source": vocabulary.Source, "marker": MARKERS,
     "weighing": set(beside.WeighingPhase) - {beside.WeighingPhase.NONE},
 }  # fmt: skip
 

@@ -30,8 +30,9 @@ def origin_of(stage: Stage) -> str:
 @contextmanager
 def live(stage: Stage, hello: str = '{"page": ""}', **headers: str) -> Iterator[ClientConnection]:
     origin: Any = headers.pop("origin", origin_of(stage))
-    address = stage.url.replace("http", "ws") + "live"
-    with connect(address, origin=origin or None, additional_headers=headers) as connection:
+    with connect(
+        stage.url.replace("http", "ws") + "live", origin=origin or None, additional_headers=headers
+    ) as connection:
         connection.send(hello)
         yield connection
 
@@ -51,8 +52,9 @@ LET_DOWN = b'{"do": "let_down"}'
 
 def act(stage: Stage, content: Any = LET_DOWN, **headers: str) -> int:
     """Ask for what `content` says; return the status."""
-    given = {"origin": origin_of(stage), **headers}
-    return httpx.post(stage.url + "action", content=content, headers=given, verify=False).status_code
+    return httpx.post(
+        stage.url + "action", content=content, headers={"origin": origin_of(stage), **headers}, verify=False
+    ).status_code
 
 
 LOADED = ("static/main.js", "static/vendor/three.module.min.js", "static/vendor/three.LICENSE", "strings")
@@ -256,10 +258,6 @@ def test_only_a_request_that_is_json_and_short_is_carried_out_and_a_live_connect
     for hello in ("", "[]", "{", "{}", "x" * 5000):
         with live(stage, hello) as connection, pytest.raises(ConnectionClosed):
             connection.recv(timeout=PATIENCE)
-    for content, status in BODIES:
-        assert stage.arms.calls == []
-        assert act(stage, content) == status
-    stage.arms.calls.clear()
     for content, status in BODIES:  # whose lengths are not stated
         assert stage.arms.calls == []
         assert act(stage, iter((content[:9], content[9:]))) == status

@@ -22,7 +22,7 @@ from exo_gravity.sim import (
     VirtualWearer,
 )
 from exo_gravity.sim.arm import DEFAULT_LINKS
-from exo_gravity.sim.script import Step, TrialScript
+from exo_gravity.sim.script import TrialScript
 from exo_gravity.sim.virtual_arm import resting
 
 NAMES = ("rotation", "abduction", "flexion", "elbow")
@@ -107,17 +107,6 @@ def test_without_a_tilt_the_arm_is_never_carried_and_the_reason_is_given():
     trial = make(tilt=None)
     assert trial.run().carried == ()
     assert "waited for effort commands" in trial.trouble and "no trunk tilt yet" in trial.trouble
-
-
-def test_steps_of_the_trunk_have_an_angle_or_only_a_duration_and_one_of_the_hand_a_mass():
-    steps = [{"bow": 0.5, "over": 3}, {"lean": -0.3, "over": 2.0}, {"walk": 60.0}, {"sit": 2}, {"load": 2, "over": 1}]
-    assert list(TrialScript.parse({"name": "trunk", "steps": steps}).steps) == [
-        Step("bow", 3.0, (0.5,)),
-        Step("lean", 2.0, (-0.3,)),
-        Step("walk", 60.0),
-        Step("sit", 2.0),
-        Step("load", 1.0, (2.0,)),
-    ]
 
 
 @pytest.mark.parametrize(

@@ -136,7 +136,13 @@ class PlayedArms:
         sentence = f"fault: {fault}: {name} elbow" if fault != "none" else state
         bridge = {**values, "level": 2 if fault != "none" else 0, "message": sentence, **self.reports.get(name, {})}
         carried = {"mass carried (kg)": "1.854", "level": 0, "message": "compensating", "state": "compensating"}
-        carried |= {"changing load": "none", "reason": "none", "weighing": "none", **self.compensator}
+        carried |= {
+            "changing load": "none",
+            "reason": "none",
+            "weighing": "none",
+            "wearer mass (kg)": f"0, {self.settings[name]['wearer.body_mass']:g}",
+            **self.compensator,
+        }
         share = dict.fromkeys(("share of the wearer (%)", "share band (%)"), "unknown")
         of_wearer = {"largest support": "0.068", "support adapts": "off", **share, **self.wearer}
         velocity = [-self.sinking * math.copysign(1.0, tau) for tau in effort]

@@ -219,6 +219,12 @@ LIMITED = {  # what differs of the recording, which is carried until s; what is 
     "unknown when it was carried": ({}, None, "when the arm was carried", 0),
     "cut short": ({}, 15.0, "15.0 s, before the script ended", 0),
     "no script": ({"steps": ()}, math.inf, "no step of a script", 0),
+    "a joint that never moved": (
+        {"position": made.trial(made.POSES, hold=4.0, push=made.PUSH).position * (0, 1, 1, 1)},
+        math.inf,
+        "right: joint 1 read one position throughout",
+        0,
+    ),
 }
 
 
@@ -228,7 +234,7 @@ def test_what_limits_the_verdict_is_noted(held, page_of, changes, end, said, cod
     carried = None if end is None else ((0.0, min(end, whole.time[-1])),)
     report = analyse(made.bag_of(replace(whole, carried=carried, **changes)))
     assert report.exit_code == code and said in printed(report) and said in page_of(report).text
-    assert len(report.arms[0][1].holds) == 3
+    assert len(report.arms[0][1].holds) == 3 and "<–" not in printed(report)
 
 
 def test_a_recording_that_is_damaged_in_part_is_judged_by_the_rest_and_ends_with_2(held):

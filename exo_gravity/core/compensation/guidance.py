@@ -68,6 +68,9 @@ class TouchLimits:
     least: float = 0.2  #: and Nm, which friction and model errors may amount to
     time: float = 0.1  #: s for which no joint is touched; 0.05 is the longest of 500 reaches and other motions
     slow: float = 1.0  #: rad/s, below which no brake acts, so that the motors should apply what is asked of them
+    #: s, of an arm that has been faster since its motors did not. A hand that lifts it and a brake that takes all of
+    #: the torque may balance for a moment
+    fast: float = 0.25
 
 
 TOUCH = TouchLimits()
@@ -119,9 +122,9 @@ class TouchWatch:
         is_applied = bool(is_loaded and np.all(np.abs(lacking) <= allowed))
         if speed <= (TOUCH.slow if is_applied else GUIDANCE.calm):
             self._is_applied = is_applied
-        is_free = self._is_applied and is_loaded and np.all(np.abs(self._touch) <= allowed)
+        is_free = is_loaded and (self._is_applied or speed > TOUCH.slow) and np.all(np.abs(self._touch) <= allowed)
         self._free_for = max(0.0, self._free_for + (dt if is_free else -0.5 * dt))  # noise is no touch
-        return self._free_for >= TOUCH.time
+        return self._free_for >= (TOUCH.time if self._is_applied else TOUCH.fast)
 
 
 Load = TypeVar("Load")

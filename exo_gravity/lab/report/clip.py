@@ -105,7 +105,7 @@ class Stage:
         self._axes.set_box_aspect((1.0, 1.0, 1.0), zoom=ZOOM)
         self._draw_wearer()
         for arm, recording in self._arms:
-            self._draw_arm(_view(arm, recording, time))
+            self._draw_arm(arm, recording, time)
         caption = f"{time:.1f} s  {_step(self._arms[0][1], time)}"
         for x, side, text in ((0.02, "left", caption), (0.98, "right", self._stamp)):
             self._axes.annotate(text, (x, 0.98), xycoords="figure fraction", ha=side, va="top", color=INK)
@@ -126,36 +126,31 @@ class Stage:
             for side in sides:
                 self._line(self._middle + np.multiply(ends, (1.0, side, 1.0)), size, BODY)
 
-    def _draw_arm(self, view: ArmView) -> None:
+    def _draw_arm(self, arm: Described, recording: Recording, time: float) -> None:
         """Draw an arm, what is shown around it, and the torque of each joint at the picture's edge on its side."""
-        origins = view.arm.pose(view.theta)[0]
+        at = min(int(np.searchsorted(recording.time, time)), len(recording.time) - 1)
+        rows = (recording.position, recording.velocity, recording.effort)
+        theta, velocity, effort = (np.nan_to_num(row[at].astype(float)).tolist() for row in rows)
+        powered = State.LETTING_DOWN if max(map(abs, effort)) > NO_TORQUE else State.DISABLED
+        state = State.ACTIVE if _is_carried(recording, time) else powered
+        origins = arm.pose(theta)[0]
         self._line(origins[1:], LIMB_SIZE, LIMB)
         self._line(origins, TUBE, COLOURS["tube"])
         for origin in origins[:-1]:
             self._line(origin[None], JOINT, COLOURS["motor"])
-        for shape in arm_shapes(view):
+        for shape in arm_shapes(ArmView(arm, theta, velocity, effort, state.value)):
             if shape.kind in (LINE, SPHERE):
                 self._line(shape.points, shape.size, shape.colour)
-        is_left = view.arm.side == "right"  # in front of the wearer
-        names, ink = view.arm.limits.joint_names, {"arrowstyle": "-", "color": LEADER}
-        for n, (name, effort) in enumerate(zip(names, view.effort, strict=True)):
+        is_left = arm.side == "right"  # in front of the wearer
+        names, ink = arm.limits.joint_names, {"arrowstyle": "-", "color": LEADER}
+        for n, (name, torque) in enumerate(zip(names, effort, strict=True)):
             *at, _ = proj_transform(*origins[n], self._axes.get_proj())
             place = (0.02 if is_left else 0.98), 0.80 - 0.72 * n / len(names)
-            label = f"{name.removeprefix(f'{view.arm.side}_').replace('_', ' ')}\n{shown(effort, 2)} Nm"
+            label = f"{name.removeprefix(f'{arm.side}_').replace('_', ' ')}\n{shown(torque, 2)} Nm"
             self._axes.annotate(
                 label, at, place, textcoords="figure fraction", ha="left" if is_left else "right", va="top", color=INK,
                 arrowprops=ink,
             )  # fmt: skip
-
-
-def _view(arm: Described, recording: Recording, time: float) -> ArmView:
-    """Return what is known of an arm at `time` s."""
-    at = min(int(np.searchsorted(recording.time, time)), len(recording.time) - 1)
-    rows = (recording.position, recording.velocity, recording.effort)
-    theta, velocity, effort = (np.nan_to_num(row[at].astype(float)).tolist() for row in rows)
-    powered = State.LETTING_DOWN if max(map(abs, effort)) > NO_TORQUE else State.DISABLED
-    state = State.ACTIVE if _is_carried(recording, time) else powered
-    return ArmView(arm, theta, velocity, effort, state.value)
 
 
 def _is_carried(recording: Recording, time: float) -> bool:

@@ -81,8 +81,8 @@ def overview(
         for hold in analysis.holds:
             axis.axvspan(hold.start, hold.end, color=HOLD_COLOUR, lw=0, zorder=0, label="hold")
         for motion in analysis.motions:
-            if motion.kind in ("push", "slip"):
-                axis.axvspan(motion.start, motion.end, color=PUSH_COLOUR, lw=0, zorder=0, label="push")
+            if motion.kind in ("push", "slip", "load"):
+                axis.axvspan(motion.start, motion.end, color=PUSH_COLOUR, lw=0, zorder=0, label=motion.kind)
         axis.set_ylabel(label)
         make_plain(axis)
     for n in range(joints) if np.isfinite(recording.command).any() else ():

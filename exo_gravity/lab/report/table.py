@@ -50,8 +50,9 @@ class Column(NamedTuple):
         texts = [shown(value, self.digits) for value in self.of(one)]
         if not self.below:
             return texts
-        bounds = zip(texts, per_minute(one.drift_rate_uncertainty), one.stray < UNMOVED, strict=True)
-        return [f"<{shown(bound, self.digits)}" if unmoved else text for text, bound, unmoved in bounds]
+        bounds = [shown(bound, self.digits) for bound in per_minute(one.drift_rate_uncertainty)]
+        columns = zip(texts, bounds, one.stray < UNMOVED, strict=True)
+        return [f"<{bound}".replace("<–", "–") if unmoved else text for text, bound, unmoved in columns]
 
 
 class Kind(NamedTuple):
@@ -132,8 +133,8 @@ def unmoved(hold: Hold) -> str:
     return "no measurable movement" + (f" (below {code:.3f} degrees)" if math.isfinite(code) else "")
 
 
-def write_csv(folder: Path, kind: Kind, arms: Iterable[Arm], row_head: Callable[[str, float], Row]) -> None:
-    """Write a table as CSV, a row for each joint. Without rows, write nothing.
+def write_csv(folder: Path, kind: Kind, arms: Iterable[Arm], row_head: Callable[[str, float], Row]) -> list[Path]:
+    """Write a table as CSV, a row for each joint; return its path. Without rows, write nothing.
 
     row_head: returns the first cells of a row, from the arm's name and the time in s.
     """
@@ -144,14 +145,17 @@ def write_csv(folder: Path, kind: Kind, arms: Iterable[Arm], row_head: Callable[
             numbers = {column.key: column.of(one) for column in kind.columns}
             for joint, name in enumerate(recording.joint_names):
                 rows.append({**shared, "joint": name, **{key: values[joint] for key, values in numbers.items()}})
-    write_rows(folder / f"{kind.name}.csv", rows)
+    return write_rows(folder / f"{kind.name}.csv", rows)
 
 
-def write_rows(path: Path, rows: Sequence[Row]) -> None:
-    """Write rows of the same columns as CSV; an unknown number is an empty cell. Without rows, write nothing."""
+def write_rows(path: Path, rows: Sequence[Row]) -> list[Path]:
+    """Write rows of the same columns as CSV; return its path. Without rows, write nothing.
+
+    An unknown number is an empty cell.
+    """
     if not rows:
         path.unlink(missing_ok=True)  # of an earlier report
-        return
+        return []
     with path.open("w", newline="", encoding="utf-8") as file:
         writer = csv.DictWriter(file, rows[0])
         writer.writeheader()
@@ -159,6 +163,7 @@ def write_rows(path: Path, rows: Sequence[Row]) -> None:
             numbers = {key: f"{value:.6g}" for key, value in row.items() if isinstance(value, float | np.floating)}
             unknown = {key: "" for key, text in numbers.items() if text in ("nan", "inf", "-inf")}
             writer.writerow({**row, **numbers, **unknown})
+    return [path]
 
 
 def arm_section(recording: Recording, analysis: TrialAnalysis, figures: Iterable[str]) -> Iterator[str]:

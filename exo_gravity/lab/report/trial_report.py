@@ -13,6 +13,7 @@ from dataclasses import dataclass
 from datetime import datetime, timezone
 from functools import cached_property
 from html import escape
+from itertools import compress
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -23,14 +24,14 @@ from rich.markup import escape as marked
 from exo_gravity.core.compensation.guidance import CAUSE_TIME
 from exo_gravity.core.errors import DataError, ParameterError
 from exo_gravity.core.safety.command import FaultCode
-from exo_gravity.core.safety.limits import Limits, limits_of
+from exo_gravity.core.safety.limits import limits_of
 from exo_gravity.core.vocabulary import NONE, Source
 from exo_gravity.lab.bag.content import BRIDGE, Bag, Event
 from exo_gravity.lab.inputs.arms import recorded_of
 from exo_gravity.lab.inputs.parameter_file import node_of
 from exo_gravity.lab.observer import WearerPart, wearer_of, wearer_sentences
 from exo_gravity.lab.report import html, table
-from exo_gravity.lab.trial.analysis import MIN_HOLD, HoldCriteria, Recording, TrialAnalysis, failures
+from exo_gravity.lab.trial.analysis import MIN_HOLD, MOVED, HoldCriteria, Recording, TrialAnalysis, failures
 from exo_gravity.lab.trial.analysis import analyse as analyse_arm
 from exo_gravity.lab.vocabulary import STATEMENTS, of_all
 
@@ -46,7 +47,6 @@ TIMESTAMP = re.compile(r"_\d{8}_\d{6}$")  # which `trial` adds to the script's n
 MAX_EVENTS = 200
 # On each figure, unless the arm is known to be real.
 STAMPS = {Source.SIMULATED: "SIMULATED", Source.UNKNOWN: "source unknown", Source.REAL: ""}
-WRITTEN = (".csv", ".png", ".html", ".pdf", ".svg", ".parquet", ".json")
 CAPTIONS = {
     "overview": "Positions, velocities and torques over time. Holds are shaded and numbered; thin lines "
     "show the command, dotted ones the limits.",
@@ -55,6 +55,7 @@ CAPTIONS = {
     "95 % band. A band that reaches zero: not distinguishable from zero. See docs/wearer_torque.md.",
 }
 
+SCREEN = html.Print()
 Worst = tuple[bool, float, str]  # whether it is worse than a small drift; rad; a sentence
 
 
@@ -185,9 +186,9 @@ def _events(report: Report, recording: Recording, analysis: TrialAnalysis) -> It
             yield _event(recording, what, peak, True, speed)
     for motion in analysis.motions:
         change = conditions.change_before(motion.start)
-        if motion.kind == "slip" or (motion.kind in ("push", "move") and not steps and change):
+        if motion.kind in MOVED or (motion.kind in ("push", "move") and not steps and change):
             bad = bool(np.max(np.abs(motion.peak)) > report.criteria.max_stray)
-            what = f"{'slipped' if steps else 'moved'} at {motion.start:.1f} s{change}: "
+            what = f"{MOVED.get(motion.kind, 'moved')} at {motion.start:.1f} s{change}: "
             yield _event(recording, what, np.abs(motion.peak), bad, motion.speed)
     for release in analysis.releases:
         if not (release.still and report.criteria.stayed(release)):
@@ -248,6 +249,10 @@ def _reservations(bag: Bag) -> Iterator[str]:
         names = ", ".join(unknown)
         yield f"{names}: the recording does not show when the arm was carried: its way down may be taken for a slip"
     for recording in bag.recordings:
+        moved = np.ptp(recording.position, axis=0) > table.UNMOVED
+        if not moved.all():
+            still = ", ".join(compress(table.joint_labels(recording), ~moved))
+            yield f"{recording.name}: {still} read one position throughout, so what drift would show is not known"
         if recording.steps and recording.carried and recording.steps[-1].end > recording.carried[-1][1] + EARLY:
             end = recording.carried[-1][1]
             what = "the recording ends" if end >= float(recording.time[-1]) else "let down"
@@ -257,7 +262,7 @@ def _reservations(bag: Bag) -> Iterator[str]:
 def write(
     report: Report,
     folder: str | Path,
-    on_paper: html.Print | None = None,
+    on_paper: html.Print = SCREEN,
     part: "Part | None" = None,
 ) -> list[Path]:
     """Write holds.csv, motions.csv, a PNG of each figure, report.html and report.json into `folder`; return the files.
@@ -269,16 +274,18 @@ def write(
     from exo_gravity.lab.report import figures  # not for the rows of many recordings: half of a process's start
 
     folder = Path(folder)
-    sections: list[str] = []
+    sections, written = list[str](), [folder / "report.html", folder / "report.json"]
     try:
         folder.mkdir(parents=True, exist_ok=True)
         for kind in table.KINDS:
-            table.write_csv(folder, kind, report.arms, report.row_head)
+            written += table.write_csv(folder, kind, report.arms, report.row_head)
         for recording, analysis in report.arms:
             source = report.bag.source(recording.name)
-            drawn = {
-                "overview": figures.overview(recording, analysis, part or figures.WHOLE, _limits(report, recording))
-            }
+            limits = None
+            with suppress(DataError, ParameterError):  # they may not be such that this version permits
+                if values := recorded_of(report.bag.parameters, recording.name, BRIDGE):
+                    limits = limits_of(values)
+            drawn = {"overview": figures.overview(recording, analysis, part or figures.WHOLE, limits)}
             if any(figures.strayed(analysis)):
                 drawn["drift"] = figures.drift(recording, analysis, report.criteria)
             if shared := report.wearers.get(recording.name):
@@ -286,9 +293,8 @@ def write(
             pictures = []
             for name, figure in drawn.items():
                 path = folder / f"{recording.name.replace('/', '_')}_{name}.png"
-                pictures.append(
-                    html.picture(html.saved(figure, path, STAMPS[source], on_paper or html.Print()), CAPTIONS[name])
-                )
+                written += [path, *(path.with_suffix(f".{suffix}") for suffix in on_paper.formats)]
+                pictures.append(html.picture(html.saved(figure, path, STAMPS[source], on_paper), CAPTIONS[name]))
             if text := figures.stayed_text(recording, analysis):
                 pictures.append(html.bullets("", [text]))
             if shared:
@@ -301,15 +307,7 @@ def write(
         (folder / "report.json").write_text(json.dumps(told), encoding="utf-8")
     except OSError as error:
         raise DataError(f"{folder}: cannot write the report there ({error.strerror})") from None
-    return sorted(path for path in folder.iterdir() if path.suffix in WRITTEN)
-
-
-def _limits(report: Report, recording: Recording) -> Limits | None:
-    """Return the limits of an arm's joints, None if the recording has none that this version permits."""
-    with suppress(DataError, ParameterError):
-        values = recorded_of(report.bag.parameters, recording.name, BRIDGE)
-        return limits_of(values) if values else None
-    return None
+    return sorted(written)
 
 
 def print_report(report: Report, console: Console | None = None) -> None:

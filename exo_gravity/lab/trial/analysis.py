@@ -26,8 +26,8 @@ from exo_gravity.sim.script import TRUNK_ACTIONS
 
 
 @dataclass(frozen=True)
-class Stillness:
-    """When an arm counts as still.
+class AnalysisTuning:
+    """When an arm counts as still, and how holds and motions are distinguished and measured.
 
     Stillness is judged from position only. Motors report velocity in steps of 22 to 24 mrad/s without a code for 0, so
     a motor at rest reports half a step. Position has steps of 0.38 mrad, and the speed limit over two blocks is ten of
@@ -38,9 +38,15 @@ class Stillness:
     speed: float = 0.02  #: rad/s, or 69 degrees per minute: an arm that moves faster is not held
     blocks: int = 10  #: at most, for each sample: bounds the memory of a recording with long gaps
     margin: float = 0.2  #: s cut off at both ends of a still span, where a smooth motion can be slower than `speed`
+    window: float = 10.0  #: s, over which `Hold.stray` is judged
+    pose_time: float = 0.5  #: s before and after a motion, over which its first and last pose are averaged
+    push_offset: float = 0.35  #: rad (20 degrees); a motion that ends farther away is a move to another pose
+    huber: float = 1.345  #: standard deviations; gives 95 % efficiency on normal noise
+    parts: int = 30  #: parts of a hold, to whose means the slope is fitted
 
 
-STILLNESS = Stillness()
+TUNING = AnalysisTuning()
+MOVED = {"slip": "slipped", "load": "gave way to a change of load"}  # what no held arm does, by the kind of the motion
 
 
 ARRAYS = ("position", "velocity", "effort", "command")  # of a recording, (n, joints) each
@@ -51,7 +57,7 @@ CARRIED = (State.RAMPING_IN, State.ACTIVE)  # the states of an arm's bridge in w
 class ScriptedStep(NamedTuple):
     """A step of the trial script."""
 
-    action: str  #: 'move', 'hold' or 'push'
+    action: str  #: of `exo_gravity.sim.script`: 'move', 'hold', 'push', 'load', ...
     start: float  #: s
     end: float  #: s
 
@@ -117,8 +123,8 @@ def in_blocks(recording: Recording) -> Blocks:
     There are no more than a few blocks for each sample, however long the recording was without any.
     """
     time, position = recording.time, recording.position
-    sparse = float(time[-1] - time[0]) / (STILLNESS.blocks * len(time))
-    length = max(STILLNESS.block, 3.0 * float(np.median(np.diff(time))), sparse)
+    sparse = float(time[-1] - time[0]) / (TUNING.blocks * len(time))
+    length = max(TUNING.block, 3.0 * float(np.median(np.diff(time))), sparse)
     count = int((time[-1] - time[0]) / length) + 1
     starts = time[0] + length * np.arange(count + 1)
     sample = np.searchsorted(time, starts)
@@ -129,7 +135,7 @@ def in_blocks(recording: Recording) -> Blocks:
     mean = np.add.reduceat(position, first, axis=0, dtype=float) / np.maximum(filled, 1)[:, None]
     low, high = (extreme.reduceat(position, first, axis=0) for extreme in (np.minimum, np.maximum))
     low[1:], high[1:] = np.minimum(low[1:], low[:-1]), np.maximum(high[1:], high[:-1])
-    still = np.all(high - low < STILLNESS.speed * 2 * length, axis=1) & (filled > 0)
+    still = np.all(high - low < TUNING.speed * 2 * length, axis=1) & (filled > 0)
     return Blocks(starts, sample, mean, still, filled == 0)
 
 
@@ -139,26 +145,12 @@ def still_spans(recording: Recording, blocks: Blocks) -> Iterator[Span]:
     windows = [(step.start, step.end) for step in recording.steps if step.action == "hold"]
     for first, beyond in zip(edges[::2], edges[1::2], strict=True):
         # A block is still if it is still together with the block before it.
-        start, end = blocks.time[max(first - 1, 0)] + STILLNESS.margin, blocks.time[beyond] - STILLNESS.margin
+        start, end = blocks.time[max(first - 1, 0)] + TUNING.margin, blocks.time[beyond] - TUNING.margin
         for low, high in windows if recording.steps else ((start, end),):
             yield from recording.while_carried(float(max(start, low)), float(min(end, high)))
 
 
 MIN_HOLD = 2.0  # s
-
-
-@dataclass(frozen=True)
-class AnalysisTuning:
-    """How holds and motions are distinguished and measured."""
-
-    window: float = 10.0  #: s, over which `Hold.stray` is judged
-    pose_time: float = 0.5  #: s before and after a motion, over which its first and last pose are averaged
-    push_offset: float = 0.35  #: rad (20 degrees); a motion that ends farther away is a move to another pose
-    huber: float = 1.345  #: standard deviations; gives 95 % efficiency on normal noise
-    parts: int = 30  #: parts of a hold, to whose means the slope is fitted
-
-
-TUNING = AnalysisTuning()
 
 
 @dataclass(frozen=True, eq=False)
@@ -190,8 +182,8 @@ class Motion:
     Without a script, a motion that ends within 20 degrees of its start is taken for a push.
     """
 
-    #: 'push', 'move', an action of the trunk ('bow', 'lean', 'walk', 'sit'), 'slip' (the arm moved during a hold of the
-    #: script), 'gap' (nothing was recorded) or 'let down' (the arm was not carried throughout)
+    #: 'push', 'move', 'load', actions of the trunk ('bow', 'lean', 'walk', 'sit'), several as 'load, bow'; 'slip' (the
+    #: arm moved during a hold of the script), 'gap' (nothing was recorded) or 'let down' (not carried throughout)
     kind: str
     start: float  #: s
     end: float  #: s
@@ -308,7 +300,7 @@ def _motion(recording: Recording, blocks: Blocks, left: Span, right: Span) -> Mo
         end=right[0],
         peak=away[np.abs(away).argmax(axis=0), joints],
         residual=residual if is_still else np.full(len(before), math.nan),
-        until_still=max(0.0, right[0] - left[1] - STILLNESS.margin) if is_still else math.nan,
+        until_still=max(0.0, right[0] - left[1] - TUNING.margin) if is_still else math.nan,
         speed=np.abs(recording.velocity[samples]).max(axis=0, initial=0.0),
     )
 
@@ -321,7 +313,8 @@ def _kind(recording: Recording, start: float, end: float, empty: bool, residual:
         return "gap"
     if not recording.steps:
         return "push" if np.all(np.abs(residual) < TUNING.push_offset) else "move"
-    return next((action for action in ("move", "push", *TRUNK_ACTIONS) if action in actions), "slip")
+    guided = next((action for action in ("move", "push") if action in actions), "")
+    return guided or ", ".join(action for action in ("load", *TRUNK_ACTIONS) if action in actions) or "slip"
 
 
 def _releases(recording: Recording, blocks: Blocks) -> Iterator[Release]:
@@ -382,9 +375,9 @@ def failures(recording: Recording, trial: TrialAnalysis, criteria: HoldCriteria)
                 found.append(f"{where} drifted {per_minute} per minute, more than {allowed}")
     for motion in trial.motions:
         peak = np.max(np.abs(motion.peak))
-        if motion.kind == "slip" and peak > criteria.max_stray:
+        if motion.kind in MOVED and peak > criteria.max_stray:
             where = f"{motion.start:.1f}-{motion.end:.1f} s: the arm"
-            found.append(f"{where} slipped by {_degrees(peak)} during a hold")
+            found.append(f"{where} {MOVED[motion.kind]} by {_degrees(peak)}")
     for release in trial.releases:
         where = f"{release.start:.1f}-{release.end:.1f} s: the arm"
         if not release.still:

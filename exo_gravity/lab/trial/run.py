@@ -120,15 +120,27 @@ class TrialScreen:
         found = (name for name, values in self.status.items() if values.get(key, NONE) != NONE)
         return next((f"{name}: {self.status[name]['message']}" for name in found), "")
 
-    @property
-    def has_no_bridge(self) -> bool:
-        """Whether no bridge reports although all nodes run already. Those that are started may need longer."""
-        return self.clock() - self._first_line > BRIDGE_TIMEOUT and not self.bridges and not self._states
-
-    @property
-    def is_let_down(self) -> bool:
-        """Whether the clock has started and not every arm is active any more."""
-        return self._start < math.inf and not self._all_active
+    def wait(self, stopped: Stopping, recorder_code: Callable[[], int | None], nodes: Future[Any]) -> str:
+        """Wait until the script is done; return '' or why the wait ended earlier."""
+        deadline = time.monotonic() + START_TIMEOUT + self.script.duration
+        while not stopped.wait(0.05) and not nodes.done():
+            if (code := recorder_code()) is not None:
+                return f"the recorder ended with exit code {code} before the trial was done"
+            if self.silence > RECORDER_TIMEOUT:
+                return f"the recorder has sent no data for {RECORDER_TIMEOUT:g} s"
+            # Those that are started may need longer until they report.
+            if self.clock() - self._first_line > BRIDGE_TIMEOUT and not self.bridges and not self._states:
+                return f"no can_bridge has reported on /diagnostics within {BRIDGE_TIMEOUT:g} s: no arm is carried here"
+            if message := self.message_of("fault") or (not self.guided and self.message_of("refusal")):
+                return message
+            if self.done:
+                stopped.wait(GRACE)
+                return ""
+            if self._start < math.inf and not self._all_active:
+                return "an arm is not active any more"
+            if time.monotonic() > deadline:
+                return f"the trial did not finish in time: {'; '.join(self.faults) or 'no node reports a fault'}"
+        return "stopped by the operator" if stopped.is_set() else ""
 
     @property
     def _step(self) -> Step | None:
@@ -161,6 +173,8 @@ class TrialScreen:
         if index != self._index:
             if self._origin:
                 self.console.print(f"     drifted {self._drift():.2f} deg")
+            if self._index < 0 and (names := next((arm.get("names") for arm in self._arms.values()), ())):
+                self.console.print(f"     joints in order: {', '.join(names)}", soft_wrap=True)
             self._index, self._step_start, self._origin = index, now, {}
             if self._step:
                 number = f"{index + 1}/{len(self.script.steps)}"
@@ -309,7 +323,7 @@ def run_trial(trial: Trial, console: Console, stopped: Stopping, on_progress: Ca
         launcher = Launcher(trial.folder / "params.yaml", on_line)
         ending = threading.Event()
         nodes = pool.submit(launcher.run, ending)
-        trouble = follow(screen, stopped, lambda: launcher.exit_code(RECORDER), nodes)
+        trouble = screen.wait(stopped, lambda: launcher.exit_code(RECORDER), nodes)
         down_by = time.monotonic() + DESCENT_TIMEOUT
         while screen.is_falling and screen.silence < 1.0 and time.monotonic() < down_by and not nodes.done():
             time.sleep(0.05)  # the recording shows how the arm comes down
@@ -324,28 +338,6 @@ def run_trial(trial: Trial, console: Console, stopped: Stopping, on_progress: Ca
         return TrialEnd()
     recorder = f": {last_errors[RECORDER]}" if RECORDER in last_errors else ""
     return TrialEnd(f"{trouble}{recorder}{stall_of(screen.status)}", 1)
-
-
-def follow(screen: TrialScreen, stopped: Stopping, recorder_code: Callable[[], int | None], nodes: Future[Any]) -> str:
-    """Wait until the script is done; return '' or why the wait ended earlier."""
-    deadline = time.monotonic() + START_TIMEOUT + screen.script.duration
-    while not stopped.wait(0.05) and not nodes.done():
-        if (code := recorder_code()) is not None:
-            return f"the recorder ended with exit code {code} before the trial was done"
-        if screen.silence > RECORDER_TIMEOUT:
-            return f"the recorder has sent no data for {RECORDER_TIMEOUT:g} s"
-        if screen.has_no_bridge:
-            return f"no can_bridge has reported on /diagnostics within {BRIDGE_TIMEOUT:g} s: no arm is carried here"
-        if message := screen.message_of("fault") or (not screen.guided and screen.message_of("refusal")):
-            return message
-        if screen.done:
-            stopped.wait(GRACE)
-            return ""
-        if screen.is_let_down:
-            return "an arm is not active any more"
-        if time.monotonic() > deadline:
-            return f"the trial did not finish in time: {'; '.join(screen.faults) or 'no node reports a fault'}"
-    return "stopped by the operator" if stopped.is_set() else ""
 
 
 def stall_of(status: Status) -> str:

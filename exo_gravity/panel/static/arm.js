@@ -26,6 +26,8 @@ export class ArmCard {
     this.isDown = false; // whether to let it down would change nothing
     this.adapts = ""; // what the support that adapts does
     this.weighed = null; // kg
+    this.names = []; // of the joints
+    this.hasWearer = true; // as its compensator says
     this.root = document.getElementById("arm").content.cloneNode(true).firstElementChild;
     this.root.dataset.arm = name;
     this.pose = document.getElementById("pose").content.cloneNode(true).firstElementChild; // stands below the picture
@@ -90,7 +92,7 @@ export class ArmCard {
 
   // State, mode and support in one line.
   summary() {
-    const mode = this.mode === "zero_g" ? `Zero-G, ${number(100 * this.support, 0)} %` : "One-G";
+    const mode = this.mode === "zero_g" ? `Zero-G, ${number(100 * this.carriedShare, 0)} %` : "One-G";
     return `${this.find(".sign").textContent} ${this.headText()}: ${this.find(".state").textContent} · ${mode}`;
   }
 
@@ -98,9 +100,9 @@ export class ArmCard {
     return this.setup?.settings?.support ?? NaN;
   }
 
-  // The share of the wearer's arm that the motors carry: none in One-G.
+  // The share of the wearer's arm that the motors carry: none in One-G, or of nobody.
   get carriedShare() {
-    return this.mode === "zero_g" ? this.support : 0;
+    return this.mode === "zero_g" && this.hasWearer ? this.support : 0;
   }
 
   get mode() {
@@ -109,10 +111,6 @@ export class ArmCard {
 
   get payload() {
     return this.setup?.settings?.["payload.mass"] ?? 0;
-  }
-
-  get hasWearer() {
-    return this.limit !== null || (this.setup?.settings?.["wearer.body_mass"] ?? 0) > 0;
   }
 
   // Limits and settings, which change rarely.
@@ -156,7 +154,7 @@ export class ArmCard {
     if (known) mark.style.left = `${100 * limit}%`;
     write(this.find("output"), Math.abs(now - value) > 0.05 ? `${number(value, 1)} % (${t("support_now", number(now, 1))})` : `${number(value, 1)} %`);
     this.slider.setAttribute("aria-valuetext", `${number(value, 1)} %`);
-    const parts = [known ? t("support_limit", number(Math.floor(1000 * limit) / 10, 1)) : t("support_unknown")];
+    const parts = [known ? t("support_limit", number(Math.floor(1000 * limit) / 10, 1)) : this.hasWearer ? "" : t("support_nobody")];
     if (known && value / 100 > limit) parts.push(t("support_over"));
     if (this.mode === "one_g") parts.push(t("support_unused"));
     parts.push(this.adapts);
@@ -182,17 +180,19 @@ export class ArmCard {
     const limit = finite(wearer?.["largest support"]);
     if (limit !== this.limit) this.limited = this.setup?.settings ?? {};
     this.limit = limit;
+    if (compensator) this.hasWearer = /[1-9]/.test(compensator["wearer mass (kg)"]);
     this.isDown = name === "letting down" || (DOWN.includes(name) && (bridge.motors ?? "off") === "off");
     this.adapts = this.adaptsText(wearer);
     showShare(this, wearer, name === "active");
     showLoad(this, compensator, wearer, operates, name === "active");
     this.root.classList.toggle("stale", !alive);
-    this.showPose(state.joints, bridge, operates);
+    this.names = state.joints?.map((joint) => joint.name) ?? this.names;
+    this.showPose(bridge, operates);
     this.find(".home").hidden = this.source !== "simulated";
     this.find(".home").disabled = !operates || !OFF.includes(name);
     const known = operates && compensator && isFinite(this.support);
     for (const button of this.root.querySelectorAll("[data-mode]")) button.disabled = !known;
-    this.slider.disabled = !known || this.mode !== "zero_g";
+    this.slider.disabled = !known || this.mode !== "zero_g" || !this.hasWearer;
     if (this.setup?.settings) this.follow();
     this.showSupport();
     this.showJoints(alive ? state.joints : null, bridge);
@@ -239,12 +239,16 @@ export class ArmCard {
   }
 
   // Whether the operator is asked if the arm hangs as it is drawn, and at which angles.
-  showPose(joints, bridge, operates) {
+  showPose(bridge, operates) {
     const angles = poseAsked(bridge);
     this.pose.hidden = !angles;
     this.pose.querySelector("button").disabled = !operates;
-    const shown = (angles ?? []).map((angle, n) => `${jointText(this.name, joints?.[n]?.name ?? "")} ${number(angle, 0)}°`);
-    write(this.pose.querySelector("p"), angles ? t("confirm_pose_ask", this.armText(), shown.join(", ")) : "");
+    write(this.pose.querySelector("p"), angles ? t("confirm_pose_ask", this.armText(), this.poseText(angles)) : "");
+  }
+
+  // angles: of the joints, in degrees.
+  poseText(angles) {
+    return angles.map((angle, n) => `${jointText(this.name, this.names[n] ?? "")} ${number(angle, 0)}°`).join(", ");
   }
 
   // What the arm does in place of resting; '' while it rests. Gravity moves it where the motors' torque opposes that.
@@ -267,7 +271,7 @@ export class ArmCard {
     rows.forEach((joint, n) => {
       const row = body.rows[n] ?? newRow(body);
       const limit = this.setup?.max_effort?.[n];
-      const cells = [jointText(this.name, joint.name), `${number(degrees(joint.position), 1)}°`, `${number(joint.effort, 2)} / ${number(limit, 1)} Nm`, `${number(temperature(joint, bridge), 0)} °C`];
+      const cells = [jointText(this.name, joint.name), `${number(degrees(joint.position), 1)}°`, `${number(joint.effort, 2)} / ${number(limit, 1)}`, `${number(temperature(joint, bridge), 0)} °C`];
       cells.forEach((text, column) => write(row.cells[column], text));
     });
   }

@@ -62,9 +62,10 @@ export function showLoad(card, compensator, wearer, operates, isCarried) {
 // isOld: whether its result is carried, or of an arm that was let down since.
 function weighingText(compensator, isOld) {
   const phase = compensator?.weighing ?? "none";
-  if (isOld && (phase === "done" || phase === "failed")) return "";
-  const trouble = `trouble.${compensator?.["weighing trouble"]}`;
-  if (phase === "failed") return t("weighing.failed", has(trouble) ? t(trouble) : compensator["weighing trouble"]);
+  const isOver = ["none", "done", "failed"].includes(phase);
+  if (isOver && isOld) return "";
+  const [trouble] = ["weigh refused", "weighing trouble"].map((key) => compensator?.[key]).filter((word) => has(`trouble.${word}`));
+  if (isOver && trouble) return t("weighing.failed", t(`trouble.${trouble}`));
   if (phase === "done") return t("weighing.done", number(finite(compensator["weighed mass (kg)"]), 2), number(finite(compensator["weighed band (kg)"]), 2));
   return has(`weighing.${phase}`) ? t(`weighing.${phase}`, number(finite(compensator["weighing time (s)"]), 0)) : "";
 }

@@ -62,7 +62,7 @@ async function send(body, done = "") {
   sent += 1;
   const turn = sent;
   const problem = await request(body);
-  if (problem !== "" || turn === sent) say(problem === null ? t("unsent") : problem ? t("refused", problem) : done);
+  if (problem !== "" || turn === sent) say(problem === null ? t("unsent") : problem ? t("refused", problem.replace(/^refused: /, "")) : done);
   return problem === "";
 }
 
@@ -103,7 +103,7 @@ async function refresh(asked) {
 }
 
 const ASKED = 0.1; // a larger change of the support of an arm that is carried is asked about: it may be a slip
-const percent = (card) => number(100 * card.support, 1);
+const percent = (card) => number(100 * card.carriedShare, 1);
 const actions = {
   send,
   down,

@@ -58,7 +58,7 @@ export class Sections {
 
   fill(settings) {
     const fields = this.form.elements;
-    fields.body_mass.value = settings["wearer.body_mass"];
+    fields.body_mass.value = settings["wearer.body_mass"] || ""; // 0: none
     fields.sex.value = settings["wearer.sex"];
     LENGTHS.forEach((name, n) => (fields[name].value = Math.round(1000 * settings["wearer.segment_length"][n]) / 10));
   }
@@ -92,7 +92,8 @@ export class Sections {
   show(state, operates) {
     const running = ["running", "reporting"].includes(state.trial.phase);
     for (const id of ["save"]) byId(id).disabled = !operates;
-    byId("trial-start").disabled = !operates || running;
+    const cards = [...this.cards.values()];
+    byId("trial-start").disabled = !operates || running || !cards.every((card) => card.state === "active");
     byId("trial-stop").disabled = !operates || state.trial.phase !== "running";
     byId("record").disabled = !operates || state.recording.on || state.recording.foreign;
     byId("record-stop").disabled = !operates || !state.recording.on || running;
@@ -100,7 +101,7 @@ export class Sections {
     write(byId("recording-text"), recordingText(state.recording));
     write(byId("saved"), state.saved ? t("saved", state.saved) : "");
     this.showTrial(state.trial);
-    const isOff = [...this.cards.values()].every((card) => OFF.includes(card.state));
+    const isOff = cards.every((card) => OFF.includes(card.state));
     this.markers.show(state.recording, isOff);
     if (state.session) this.session.show(state, operates, isOff);
   }
@@ -108,7 +109,7 @@ export class Sections {
   showTrial(trial) {
     const step = trial.steps?.[trial.step];
     write(byId("trial-text"), trialText(trial));
-    write(byId("trial-step"), trial.phase === "running" && step ? stepText(step) : "");
+    write(byId("trial-step"), trial.phase === "running" && step ? stepText(step, this.cards.values().next().value) : "");
     const report = byId("trial-report");
     report.hidden = !trial.report;
     if (trial.report) report.href = fileAt("report", trial.report);
@@ -214,7 +215,8 @@ class Session {
   show(state, operates, isOff) {
     const { recording, session, trial } = state;
     for (const control of this.form.elements) control.disabled = !operates || !isOff;
-    byId("keep-wearer").disabled = !operates || !session.subject;
+    const [first] = this.sections.cards.values();
+    byId("keep-wearer").disabled = !operates || !session.subject || first?.setup?.settings["wearer.body_mass"] === 0;
     byId("past-filter").disabled = !isOff;
     for (const button of byId("past").querySelectorAll("button")) button.disabled = !operates || !isOff;
     const present = JSON.stringify(session);
@@ -286,7 +288,9 @@ function trialText(trial) {
   return t(`trial.${trial.phase}`, trial.name);
 }
 
-function stepText(step) {
-  const kilograms = step.action === "load";
-  return t(`step.${step.action}`, step.value.map((value) => (kilograms ? number(value, 1) : number(degrees(value), 0))).join("° "));
+// card: of an arm, whose joints a pose names.
+function stepText({ action, value }, card) {
+  if (action === "load") return value[0] ? t("step.load", number(value[0], 1)) : t("step.unload");
+  const angles = value.map(degrees);
+  return t(`step.${action}`, action === "move" ? card.poseText(angles) : number(angles[0], 0));
 }

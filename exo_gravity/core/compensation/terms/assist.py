@@ -48,14 +48,11 @@ class Assist(TermParameters):
 
 
 class AssistInput:
-    """Follows one stream of efforts. Every time is in s on the caller's monotonic clock.
-
-    reason: why there is no full assistance.
-    """
+    """Follows one stream of efforts. Every time is in s on the caller's monotonic clock."""
 
     def __init__(self, names: Sequence[str], assist: Assist | None = None) -> None:
         self.assist = assist or Assist()
-        self.reason = NOTHING_YET
+        self._why = NOTHING_YET
         self._names = list(names)
         self._target: Torque = (0.0,) * len(self._names)  # the newest efforts
         self._begin = math.inf  # s, since when they are followed
@@ -67,16 +64,16 @@ class AssistInput:
     @property
     def state(self) -> str:
         """'off', 'waiting', 'refused' or 'assisting', as of the last call of `torque`."""
-        if self.idle:
+        if not self.assist.on:
             return "off"
         if not self.reason:
             return "assisting"
         return "refused" if self._last - self._refused < ASSIST.recovery else "waiting"
 
     @property
-    def idle(self) -> bool:
-        """Whether `torque` returns nothing, and will until the next message."""
-        return not self.assist.on
+    def reason(self) -> Reason:
+        """Why there is no full assistance."""
+        return self._why if self.assist.on else Reason(AssistProblem.OFF, "assist.max_effort is 0")
 
     @property
     def valid(self) -> float:
@@ -98,7 +95,7 @@ class AssistInput:
             self._period += ASSIST.smoothing * (min(interval, ASSIST.slowest) - self._period)
         problem = self._problem(now, names, efforts, stamp, from_another and is_stream)
         if problem:
-            self._refused, self.reason = now, problem
+            self._refused, self._why = now, problem
             return
         self._stamp = stamp
         self._target = tuple(float(efforts[names.index(name)]) for name in self._names)
@@ -129,11 +126,9 @@ class AssistInput:
         """Return whether the newest efforts are to be followed at `now`; note why not."""
         if now - self._refused < ASSIST.recovery:
             return False  # `reason` says what was wrong
-        if not self.assist.on:
-            self.reason = Reason(AssistProblem.OFF, "assist.max_effort is 0")
-        elif now - self._stamp > self.valid:
-            stopped = Reason(AssistProblem.STOPPED, "assist_efforts stopped")
-            self.reason = NOTHING_YET if self._stamp == -math.inf else stopped
+        if now - self._stamp <= self.valid:
+            self._why = NO_REASON
         else:
-            self.reason = NO_REASON
+            is_new = self._stamp == -math.inf
+            self._why = NOTHING_YET if is_new else Reason(AssistProblem.STOPPED, "assist_efforts stopped")
         return not self.reason

@@ -174,7 +174,7 @@ class Terms:
         self._refusal = "" if math.isfinite(sum(total)) else "torque of the terms is not finite"
         if self._refusal:
             total, self._acceleration = self._none, AccelerationFilter()  # it may have kept what is not finite
-        self._assisted = self._none if self.assist.idle else self.assist.torque(now)
+        self._assisted = self.assist.torque(now) if self.assist.assist.on else self._none
         return self._whole(total)
 
     def torque_of(self, other: TermsInForce) -> Torque:
