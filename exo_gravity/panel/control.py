@@ -48,7 +48,6 @@ SETTABLE = {param.name: param for param in (*COMPENSATOR, *URDF) if param.name i
 OF_SUBJECT = {p.name: p for p in COMPENSATOR if p.name in (*LOAD[1:4], "limits.lower", "limits.upper")}
 
 Values = Mapping[str, Any]
-FIELDS = ("position", "velocity", "effort")
 NEWS_DELAY = 1.5  # s after a fault in which the panel may still learn of a change that came before it
 
 
@@ -61,8 +60,10 @@ def joint_rows(states: Any) -> list[dict[str, Any]]:
     def known(values: Sequence[float], n: int) -> float | None:
         return round(values[n], 4) if n < len(values) and math.isfinite(values[n]) else None
 
-    joints = enumerate(states.name)
-    return [{"name": name, **{field: known(getattr(states, field), n) for field in FIELDS}} for n, name in joints]
+    return [
+        {"name": name, **{field: known(getattr(states, field), n) for field in ("position", "velocity", "effort")}}
+        for n, name in enumerate(states.name)
+    ]
 
 
 def setup_of(nodes: Mapping[str, tuple[Values, Values]]) -> dict[str, Any]:
@@ -324,8 +325,7 @@ class Control:
 
     async def _let_down(self, arms: Collection[str]) -> str:
         """Let the arms down all at once: none waits for another."""
-        asked = (self.arms.ask("let_down", arm, {}) for arm in arms)
-        results = await asyncio.gather(*asked, return_exceptions=True)
+        results = await asyncio.gather(*(self.arms.ask("let_down", arm, {}) for arm in arms), return_exceptions=True)
         problems = [f"{type(r).__name__}: {r}" if isinstance(r, BaseException) else r for r in results]
         failed = [f"{arm}: {problem}" for arm, problem in zip(arms, problems, strict=True) if problem]
         return "; ".join(failed) if arms else "no arm is present"

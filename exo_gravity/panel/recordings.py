@@ -122,10 +122,9 @@ class Recordings:
 
     async def save(self) -> str:
         """Write the parameters in force as YAML, from which `launcher` starts."""
-        nodes = self._device.parameters().items()
         content = {
             node: {name: value for name, value in sorted(values.items()) if value != [] and name not in ROS_PARAMETERS}
-            for node, values in nodes
+            for node, values in self._device.parameters().items()
             if values and not node.endswith((RECORDER, "/panel"))
         }
         if not content:
@@ -213,8 +212,8 @@ class Recordings:
 
     async def keep_wearer(self) -> str:
         """Write the wearer's data and workspace in force to the subject's file."""
-        nodes = self._device.parameters().items()
-        in_force: dict[str, Any] = next((values for node, values in nodes if node.endswith("/compensator")), {})
+        nodes: dict[str, dict[str, Any]] = self._device.parameters()
+        in_force = next((values for node, values in nodes.items() if node.endswith("/compensator")), {})
         if not self._present["subject"] or not in_force:
             return "no subject is chosen" if in_force else "no arm has been found yet"
         if in_force.get("wearer.body_mass") == 0.0:

@@ -58,8 +58,7 @@ def write_clip(bag: Bag, path: Path, step: float, frame_rate: int, console: Cons
     """
     end, is_gif = min(float(recording.time[-1]) for recording in bag.recordings), path.suffix.lower() == ".gif"
     times = [step * n for n in range(int(end / step) + 1)]
-    hidden = not console.is_terminal
-    drawn = track(times, f"drawing {path.name}", console=console, transient=True, disable=hidden)
+    drawn = track(times, f"drawing {path.name}", console=console, transient=True, disable=not console.is_terminal)
     try:
         stage = Stage(bag, GIF_SIZE if is_gif else SIZE)
         if is_gif:
@@ -172,6 +171,5 @@ def _description(bag: Bag, name: str) -> Described:
     values = {executable: recorded_of(bag.parameters, name, executable) for executable in ("compensator", "can_bridge")}
     for executable, given in values.items():
         if not given:
-            node = node_of(name, executable)
-            raise DataError(f"{name}: the recording has no parameters of {node}, which describe the arm")
+            raise DataError(f"{name}: the recording has no parameters of {node_of(name, executable)}, its description")
     return described(**values)

@@ -29,7 +29,6 @@ COLUMNS = (
 )  # fmt: skip
 
 Row = dict[str, Any]  # by COLUMNS; None where unknown
-Summaries = Iterable[Outcome[str, list[Row]]]
 
 
 def recordings_below(path: Path) -> list[Path]:
@@ -137,7 +136,7 @@ def spectral_arc_length(speed: np.ndarray, rate: float) -> float:
 def summaries(
     recordings: Sequence[Path],
     work: Callable[[str], list[Row]],
-    run: Callable[[Callable[[str], list[Row]], Sequence[str]], Summaries],
+    run: Callable[[Callable[[str], list[Row]], Sequence[str]], Iterable[Outcome[str, list[Row]]]],
     done: Callable[[], object],
 ) -> list[Row]:
     """Return the rows of the recordings in their order.

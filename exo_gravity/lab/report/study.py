@@ -256,7 +256,6 @@ def figure(trials: Sequence[Row], keys: Sequence[str]) -> Figure | None:
         return None
     drawn = Figure(figsize=(12.0, 2.6 * len(measured)), layout="constrained")
     axes: Any = drawn.subplots(len(measured), 1 + bool(series), sharex="col", squeeze=False)
-    colours = html.joint_colours(len(series))
     for row, (measure, groups) in zip(axes, measured.items(), strict=True):
         for who in {who: None for group in groups.values() for who in group}:
             line = [group.get(who, np.nan) for group in groups.values()]
@@ -267,7 +266,7 @@ def figure(trials: Sequence[Row], keys: Sequence[str]) -> Figure | None:
             row[0].errorbar(place, mean, half, **look)
         row[0].set_xlim(-0.5, len(groups) - 0.5)
         row[0].set_ylabel(f"{measure.name}\n{measure.unit}")
-        for (name, rows, session), colour in zip(series, colours, strict=True):
+        for (name, rows, session), colour in zip(series, html.joint_colours(len(series)), strict=True):
             values = np.array([measure.of(one) for one in rows])
             known = np.isfinite(values)
             days = np.unique(session[known])

@@ -218,8 +218,8 @@ def _fault_near(bag: Bag, arm: str, time: float) -> str:
     fault = next((status for status in near if status.node == bridge and status.fault != NONE), None)
     if fault is None:
         return ""
-    meanings = {code.value: code.meaning for code in FaultCode}  # for recordings without the fault's text
-    return f"{fault.fault}: {fault.fault_text or meanings.get(fault.fault, 'a fault')}"
+    meaning = next((code.meaning for code in FaultCode if code == fault.fault), "a fault")
+    return f"{fault.fault}: {fault.fault_text or meaning}"  # some recordings lack the fault's text
 
 
 def analyse(bag: Bag, criteria: HoldCriteria | None = None, min_hold: float = MIN_HOLD, trouble: str = "") -> Report:
@@ -241,22 +241,20 @@ def analyse(bag: Bag, criteria: HoldCriteria | None = None, min_hold: float = MI
 
 def _reservations(bag: Bag) -> Iterator[str]:
     """Yield what is missing, and what the report does instead."""
-    unscripted = [recording.name for recording in bag.recordings if not recording.steps]
-    if unscripted:
-        yield f"{', '.join(unscripted)}: no step of a script was recorded: every still phase is taken for a hold"
-    unknown = [recording.name for recording in bag.recordings if recording.carried is None]
-    if unknown:
-        names = ", ".join(unknown)
-        yield f"{names}: the recording does not show when the arm was carried: its way down may be taken for a slip"
     for recording in bag.recordings:
+        name = recording.name
+        if not recording.steps:
+            yield f"{name}: no step of a script was recorded: every still phase is taken for a hold"
+        if recording.carried is None:
+            yield f"{name}: the recording does not show when the arm was carried: its way down may be taken for a slip"
         moved = np.ptp(recording.position, axis=0) > table.UNMOVED
         if not moved.all():
             still = ", ".join(compress(table.joint_labels(recording), ~moved))
-            yield f"{recording.name}: {still} read one position throughout, so what drift would show is not known"
+            yield f"{name}: {still} read one position throughout, so what drift would show is not known"
         if recording.steps and recording.carried and recording.steps[-1].end > recording.carried[-1][1] + EARLY:
             end = recording.carried[-1][1]
             what = "the recording ends" if end >= float(recording.time[-1]) else "let down"
-            yield f"{recording.name}: {what} at {end:.1f} s, before the script ended: only the time before is judged"
+            yield f"{name}: {what} at {end:.1f} s, before the script ended: only the time before is judged"
 
 
 def write(

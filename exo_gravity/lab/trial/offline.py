@@ -187,8 +187,11 @@ def simulated_trials(params: Path, script: TrialScript) -> list[OfflineTrial]:
     Raises ParameterError that names the node and the parameter.
     """
     nodes = load(params)
-    found = [node for node in nodes if node.endswith("/simulator")]
-    simulators = {node: node_values(nodes, node, simulator_table(nodes[node])) for node in found}
+    simulators = {
+        node: node_values(nodes, node, simulator_table(values))
+        for node, values in nodes.items()
+        if node.endswith("/simulator")
+    }
     if not simulators:
         raise ParameterError("params", str(params), "a file with a simulator: --offline runs the simulated device only")
     with_imu = next((values for values in simulators.values() if values["imu.topic"] and "/imu" in nodes), None)
@@ -271,7 +274,6 @@ def trunk_imu(config: ImuConfig, rotation_trunk_from_imu: Sequence[float], cycle
     return measure
 
 
-STATUS = content.READ[content.DIAGNOSTICS]
 Unsent = tuple[str, float, str, tuple[Any, ...]]  # topic, s, type, and the message's fields after its header, if any
 
 
@@ -346,7 +348,7 @@ def _status(now: float, level: int, name: str, text: str, **values: str) -> Unse
     """Return the status of a node at `now` s."""
     pairs = [TYPES.types["diagnostic_msgs/msg/KeyValue"](*pair) for pair in values.items()]
     status = TYPES.types["diagnostic_msgs/msg/DiagnosticStatus"](level, name, text, "", pairs)
-    return content.DIAGNOSTICS, now, STATUS, ([status],)
+    return content.DIAGNOSTICS, now, content.READ[content.DIAGNOSTICS], ([status],)
 
 
 def _serialised(start: int, topic: str, now: float, kind: str, fields: tuple[Any, ...]) -> Message:

@@ -242,8 +242,6 @@ GRACE = 0.5  # s recorded after the last step
 RECORDER_TIMEOUT = 10.0  # s without a line from the recorder
 LONG_GAP = 50.0  # ms; a simulated device loses time after such a stall
 
-Status = Mapping[str, Mapping[str, Any]]  # of each node on /diagnostics, as in the recorder's live lines
-
 
 def is_guided(params: Path) -> bool:
     """Return whether a person performs the script, because the parameter file has no simulator."""
@@ -340,8 +338,11 @@ def run_trial(trial: Trial, console: Console, stopped: Stopping, on_progress: Ca
     return TrialEnd(f"{trouble}{recorder}{stall_of(screen.status)}", 1)
 
 
-def stall_of(status: Status) -> str:
-    """Return, as a clause, which simulator or bridge was not run for long while a simulated trial failed, or ''."""
+def stall_of(status: Mapping[str, Mapping[str, Any]]) -> str:
+    """Return, as a clause, which simulator or bridge was not run for long while a simulated trial failed, or ''.
+
+    status: of each node on /diagnostics, as in the recorder's live lines.
+    """
     for key, node in (("longest stall (ms)", "simulator"), ("longest silence (ms)", "can_bridge")):
         for name, values in status.items():
             if values.get("disconnected") == "no" and float(values[key]) >= LONG_GAP:  # a simulator's

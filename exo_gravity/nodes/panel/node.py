@@ -157,8 +157,11 @@ class Arms:
 
     def parameters(self) -> dict[str, dict[str, Any]]:
         """Return the parameters of every node that runs, by full name."""
-        found = sorted(self._others.found.copy().items())
-        return {name: dict(parameters.values) for name, parameters in found if parameters.is_present}
+        return {
+            name: dict(parameters.values)
+            for name, parameters in sorted(self._others.found.copy().items())
+            if parameters.is_present
+        }
 
     def states(self) -> dict[str, str | None]:
         """Return the state that each bridge reports; None if it is silent."""
