@@ -116,19 +116,15 @@ class PanelServer:
             ws_ping_timeout=10.0, timeout_graceful_shutdown=1,
         )  # fmt: skip
         self._server = uvicorn.Server(config)
-        self._thread = threading.Thread(target=self._server.run, args=([self._socket],), name="panel", daemon=True)
-        self._thread.start()
+        #: alive while it serves
+        self.thread = threading.Thread(target=self._server.run, args=([self._socket],), name="panel", daemon=True)
+        self.thread.start()
 
     def stop(self) -> None:
         """Close all connections and end the thread."""
         self._server.should_exit = True
-        self._thread.join(SERVING.stop_timeout)
+        self.thread.join(SERVING.stop_timeout)
         self._socket.close()
-
-    @property
-    def is_running(self) -> bool:
-        """Whether it still serves."""
-        return self._thread.is_alive()
 
     async def _on_live(self, connection: WebSocket) -> None:
         """Send to a page and receive its confirmations until it closes."""

@@ -48,13 +48,10 @@ class Part:
         return [joint - 1 for joint in self.joints] or [*range(count)], within
 
 
-WHOLE = Part()
-
-
 def overview(
     recording: Recording,
     analysis: TrialAnalysis,
-    part: Part = WHOLE,
+    part: Part | None = None,
     limits: Limits | None = None,
 ) -> Figure:
     """Return positions, velocities and torques over time, with holds and pushes shaded and holds numbered.
@@ -63,7 +60,7 @@ def overview(
 
     Raises ParameterError if it has none of that part.
     """
-    shown_joints, within = part.of(recording)
+    shown_joints, within = (part or Part()).of(recording)
     time, joints = recording.time[within], len(shown_joints)
     figure = Figure(figsize=(WIDTH, 8.2), layout="constrained")
     axes = figure.subplots(3, 1, sharex=True, height_ratios=(1.25, 1.0, 1.25))

@@ -82,8 +82,7 @@ def document(title: str, when: str, body: Iterable[str]) -> str:
 
 def verdict(sentence: str, reasons: Iterable[str] = (), good: bool = True) -> str:
     """Return a banner with the conclusion, and the reasons for it."""
-    kind = "verdict" if good else "verdict not"
-    return f'<div class="{kind}"><b>{escape(sentence)}</b>{_items(reasons)}</div>'
+    return f'<div class="verdict{"" if good else " not"}"><b>{escape(sentence)}</b>{_items(reasons)}</div>'
 
 
 def heading(text: str, level: int = 3) -> str:

@@ -283,7 +283,7 @@ def write(
             with suppress(DataError, ParameterError):  # they may not be such that this version permits
                 if values := recorded_of(report.bag.parameters, recording.name, BRIDGE):
                     limits = limits_of(values)
-            drawn = {"overview": figures.overview(recording, analysis, part or figures.WHOLE, limits)}
+            drawn = {"overview": figures.overview(recording, analysis, part, limits)}
             if any(figures.strayed(analysis)):
                 drawn["drift"] = figures.drift(recording, analysis, report.criteria)
             if shared := report.wearers.get(recording.name):

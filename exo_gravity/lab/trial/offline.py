@@ -38,7 +38,7 @@ from exo_gravity.lab.bag.writer import BagWriter, Message, offered_qos
 from exo_gravity.lab.inputs.arms import node_values, read_arm
 from exo_gravity.lab.inputs.parameter_file import load, node_of
 from exo_gravity.lab.trial.analysis import ARRAYS, CARRIED, Recording, ScriptedStep, Span
-from exo_gravity.lab.trial.run import Trial, TrialEnd
+from exo_gravity.lab.trial.run import GRACE, Trial, TrialEnd
 from exo_gravity.sim.controllers import DirectController
 from exo_gravity.sim.device import SimulatedDevice, VirtualWearer
 from exo_gravity.sim.params import device_of, imu_of, set_faults, simulator_table
@@ -47,7 +47,6 @@ from exo_gravity.sim.trunk_motion import ImuConfig, SimulatedImu, TrunkState, me
 from exo_gravity.sim.virtual_arm import TrunkReading, TrunkSensor, VirtualArm, resting
 
 NOT_OK = 2  # the level of an event, as diagnostic_msgs/DiagnosticStatus has it
-GRACE = 0.5  # s from the end of the script until the arm is let down
 
 
 @dataclass(frozen=True)

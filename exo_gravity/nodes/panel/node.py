@@ -305,7 +305,7 @@ class Panel(Node):
         self._diagnostics.report(OK, f"action {self._noted}: {text}", values)
 
     def _send_state(self) -> None:
-        if not self._server.is_running:
+        if not self._server.thread.is_alive():
             self.failure = RuntimeError("the web server has ended")
         nodes = self._arms.nodes()
         if nodes != self._shown:
