@@ -87,31 +87,23 @@ class MomentModel:
 
     def along_axes(self, theta: np.ndarray) -> np.ndarray:
         """Return the torque (m, n, k, 3) in Nm per kg m with gravity along each axis of the base, at `theta` (m, n)."""
-        axes, _, moments = self._turned(theta)
+        turns, moments, moved = self._turned(theta)
         pulls = -moments[:, None] @ TURN  # (m, 3, k, 3), each axis of the base x moment
-        return np.moveaxis(axes[:, None] @ np.swapaxes(pulls, 2, 3) * self._carried, 1, -1)
+        return np.moveaxis(turns[:, None, :, 0] @ np.swapaxes(pulls, 2, 3) * self.gravity * moved, 1, -1)
 
     def rows(self, theta: np.ndarray, direction: np.ndarray) -> np.ndarray:
         """Return the torque (m, n, k) in Nm per kg m at `theta` (m, n) rad. direction: (3,) or (m, 3)."""
         return np.einsum("mnka,ma->mnk", self.along_axes(theta), np.broadcast_to(direction, (len(theta), 3)))
 
-    @cached_property
-    def _carried(self) -> np.ndarray:
-        """Gravity in m/s^2 where a joint carries a moment, 0 elsewhere, (n, k)."""
-        return np.asarray(self.gravity * self.moved_by[:, self._columns[0]])
-
-    @cached_property
-    def _columns(self) -> tuple[np.ndarray, np.ndarray]:
-        """The links (k,) and directions (k, 3) of `base`."""
-        links, ways = zip(*self.base, strict=True)
-        return np.array(links), np.array(ways)
-
     def _turned(self, theta: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Return axes (m, n, 3), turns (m, n, 3, 3) and directions of the moments (m, k, 3) in the base's axes."""
-        frames, (link, ways) = self.arm.frames(theta), self._columns
+        """Return turns (m, n, 3, 3) and directions of the moments (m, k, 3) in the base's axes; and what moves what.
+
+        The last: whether a joint moves the link of a moment, (n, k).
+        """
+        frames, links = self.arm.frames(theta), [link for link, _ in self.base]
         turns = self.turns @ np.swapaxes(frames.before, 2, 3)
-        moments = frames.after[:, link] @ ways[..., None]
-        return turns[:, :, 0], turns, moments[..., 0]
+        ways = np.array([way for _, way in self.base])[..., None]
+        return turns, (frames.after[:, links] @ ways)[..., 0], self.moved_by[:, links]
 
     @cached_property
     def upright(self) -> np.ndarray:
@@ -161,8 +153,8 @@ class MomentModel:
         the moment along its axis, which counts as one of the link before: a fit takes what is missing for moments of
         that link.
         """
-        axes, turns, moments = self._turned(theta)
-        moved = self.moved_by[:, self._columns[0]]  # (n, k)
+        turns, moments, moved = self._turned(theta)
+        axes = turns[:, :, 0]
         cross = np.cross(axes[:, :, None], moments[:, None]) * moved[..., None]  # (m, n, k, 3)
         # By joint j and its turn t: (m, n, k, j, t, 3)
         both = np.cross(turns[:, None, None], cross[:, :, :, None, None])

@@ -102,7 +102,7 @@ class BusScan(contextlib.ExitStack):
         self._reporting = [board for board in boards if not board.questions(1)]
         self._boards: dict[int, WireFormat] = {}  # of each motor that has answered or reported
         self._v3: dict[int, MotorAnswer] = {}  # the newest status of each board that reports by itself
-        self._gaps: dict[int, float] = {}  # s, the shortest between two of their status frames
+        self._reports: dict[int, int] = {}  # status frames of each within LISTEN_TIME
         lock = BusLock(address, f"calibrate motors (PID {os.getpid()})", clock=clock)
         self.callback(lock.release)
         try:
@@ -113,12 +113,9 @@ class BusScan(contextlib.ExitStack):
                 )
             self._port = CanPort(open_bus(*address), clock, is_fd=is_fd(address[2]))
             self.callback(self._port.close)
-            heard_at: dict[int, float] = {}
             for message, kind, answer in self._frames(LISTEN_TIME):
                 if answer and message.is_extended_id:
-                    now, last = self._now(), heard_at.get(answer.can_id, -math.inf)
-                    self._gaps[answer.can_id] = min(now - last, self._gaps.get(answer.can_id, math.inf))
-                    heard_at[answer.can_id] = now
+                    self._reports[answer.can_id] = self._reports.get(answer.can_id, 0) + 1
                 heard = message.arbitration_id
                 if (kind == COMMAND) if message.is_extended_id else (heard <= MAX_CAN_ID):
                     raise BusError(
@@ -151,8 +148,8 @@ class BusScan(contextlib.ExitStack):
                 )
         for can_id in sorted(can_id for can_id in self._v3 if can_id > MAX_CAN_ID):
             problems.append(f"ID {can_id}: a V3 board; its ID must be from 1 to {MAX_CAN_ID}")
-        for can_id, gap in sorted(self._gaps.items()):
-            if (rate := 1.0 / max(gap, 1e-6)) < SERVO_RATE:
+        for can_id, count in sorted(self._reports.items()):
+            if (rate := count / LISTEN_TIME) < SERVO_RATE:
                 problems.append(
                     f"ID {can_id}: about {rate:.0f} status frames a second: a V1 or V2 board in servo mode, to be "
                     f"set to MIT mode with the vendor's tool, or a V3 board, to be set to {MAX_STATUS_RATE:g} a second"

@@ -115,13 +115,6 @@ class WornArm:
         known[:, at.moment] = np.linalg.inv(np.linalg.cholesky(covariance))
         return Known(start, error, least, known)
 
-    def allowed(self, moments: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return `largest_moment`, (n,) kg m, and the torque of what lies beside the links, (n,) Nm."""
-        skeleton = self.model.holding(self.model.moments + moments).skeleton()
-        if skeleton is None:
-            return np.zeros(self.model.count), np.zeros(self.model.count)
-        return skeleton.moments, self.model.gravity * skeleton.beside
-
 
 def calibrate_wearer(options: argparse.Namespace, arm: ConfiguredArm, say: Say) -> CalibrationResult:
     """Measure the wearer's relaxed arm, or take it from `options.bag`. Raises ParameterError."""
@@ -178,7 +171,8 @@ def wearer_from(
         for name, one in zip(arm.joint_names, stiffness, strict=True)
         if one > MAX_TISSUE
     ]
-    largest, beside = worn.allowed(moments)
+    skeleton, nothing = model.holding(model.moments + moments).skeleton(), np.zeros(count)
+    largest, beside = (skeleton.moments, model.gravity * skeleton.beside) if skeleton else (nothing, nothing)
     way = np.minimum(np.maximum(np.abs(arm.low - rest), np.abs(arm.high - rest)), TISSUE_REACH)
     added = beside + own.largest(arm.low.tolist(), arm.high.tolist()) + stiffness * way
     lines = (
