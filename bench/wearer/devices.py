@@ -23,8 +23,8 @@ from exo_gravity.core.numbers import Vector
 from exo_gravity.lab.calibration.identification import next_pose
 from exo_gravity.lab.calibration.moment_model import MomentModel
 from exo_gravity.lab.calibration.tour import candidates, hanging
+from exo_gravity.lab.calibration.tours import WEARER, wearer_from
 from exo_gravity.lab.calibration.tracking import Observation
-from exo_gravity.lab.calibration.wearer import WEARER, wearer_from
 from exo_gravity.sim import ArmConfig, Firmware, SimulatedArm, SimulatedDevice, SimulatedMotor
 from exo_gravity.sim.arm import DEFAULT_LINKS
 

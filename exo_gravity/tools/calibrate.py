@@ -37,7 +37,7 @@ COMMANDS = {
     "gravity": ("tours", "the robot's first moments, from a slow tour of poses"),
     "friction": ("tours", "friction of each joint, from slow sweeps"),
     "scale": ("tours", "torque scale of each motor, from a known weight on the last link"),
-    "wearer": ("wearer", "the moments of the wearer's relaxed arm"),
+    "wearer": ("tours", "the moments of the wearer's relaxed arm"),
     "check": ("tours", "whether a few poses still need the torque of the last calibration"),
     "imu": ("imu", "the mounting of the IMU, from standing upright and bowing"),
     ACCEPTANCE: ("", "a record (JSON) of what the first real, unworn arm shows on the bench, step by step"),

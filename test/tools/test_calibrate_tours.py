@@ -24,9 +24,8 @@ from exo_gravity.core.params import values_of
 from exo_gravity.lab.calibration import recorded, tours
 from exo_gravity.lab.calibration.identification import identify
 from exo_gravity.lab.calibration.tour import CALIBRATOR, Itinerary, friction_stations, observations_in, tour_of
-from exo_gravity.lab.calibration.tours import checked, friction_from, moments_from
+from exo_gravity.lab.calibration.tours import WornArm, checked, friction_from, moments_from, wearer_from
 from exo_gravity.lab.calibration.tracking import Observation
-from exo_gravity.lab.calibration.wearer import WornArm, wearer_from
 from exo_gravity.lab.inputs.arms import configured_arm, read_arm
 from exo_gravity.lab.inputs.parameter_file import load, text_of
 from exo_gravity.lab.trial.analysis import Recording

@@ -23,9 +23,16 @@ from exo_gravity.lab.calibration.moment_model import DescribedModel
 from exo_gravity.lab.calibration.moment_model import model_of as moments_of_values
 from exo_gravity.lab.calibration.result import CalibrationResult, page_of, write_changes
 from exo_gravity.lab.calibration.tour import TorqueGuess, candidates
-from exo_gravity.lab.calibration.tours import friction_from, model_of, moments_from, tour_parameters
+from exo_gravity.lab.calibration.tours import (
+    WEARER,
+    WornArm,
+    friction_from,
+    model_of,
+    moments_from,
+    tour_parameters,
+    wearer_from,
+)
 from exo_gravity.lab.calibration.tracking import Observation
-from exo_gravity.lab.calibration.wearer import WEARER, WornArm, wearer_from
 from exo_gravity.lab.inputs.arms import ConfiguredArm, configured_arm, read_arm
 from exo_gravity.lab.inputs.parameter_file import load, packaged_config, text_of
 
