@@ -113,7 +113,6 @@ class Places(NamedTuple):
 
 DISTURBED = "Was it touched, does a joint slip or touch a stop?"
 EXACT = 1e-5  # error of a value that is held
-NEAR = 1e-3  # standard errors, within which an unknown is at its lowest value
 
 
 class FitLayout(NamedTuple):
@@ -298,7 +297,6 @@ def solve(rows: Rows, known: Known, effort: np.ndarray, spread: np.ndarray, reac
     for _ in range(FIT.steps):
         bounds = known.least, np.inf
         unknowns = least_squares(off, unknowns, by_unknowns, bounds, x_scale=known.error, max_nfev=FIT.most).x
-        unknowns = np.where(unknowns - known.least < NEAR * known.error, known.least, unknowns)
         covariance = covariance_at(unknowns)
         poses, residual = rows.jacobian(unknowns) / sigma[..., None], effort - rows.predicted(unknowns)
         left = np.eye(effort.shape[1]) - poses @ covariance @ np.swapaxes(poses, 1, 2)  # (m, n, n)
@@ -399,20 +397,6 @@ def next_pose(
     rows = _sensitivity(candidates, direction, moments, model)
     added = np.eye(model.count) + rows @ np.linalg.inv(information) @ rows.transpose(0, 2, 1)
     return int(np.argmax(np.linalg.slogdet(added)[1].round(6)))
-
-
-def missing_pose(hidden: np.ndarray, direction: Vector, model: MomentModel) -> str:
-    """Return, in words, the suggested pose that shows most of the unknowns of which `hidden` (count,) are not known."""
-    poses, known = model.suggested, _before(model)
-    shown = _sensitivity(poses, direction, model.moments, model) * known * hidden[: len(known)]
-    best = poses[int(np.argmax((shown**2).sum(axis=(1, 2))))]
-    return f"[{', '.join(f'{math.degrees(angle):.0f}' for angle in best)}] degrees"
-
-
-def shown_by(model: MomentModel, poses: np.ndarray, direction: Vector) -> np.ndarray:
-    """Return which of the moments, torque scales and offsets `poses` (m, n) rad could show."""
-    shown = _sensitivity(poses, direction, model.moments, model) * _before(model)
-    return np.asarray(np.sqrt((shown**2).sum(axis=(0, 1))) > SHOWS.shown * math.sqrt(len(poses)))
 
 
 def _before(model: MomentModel) -> np.ndarray:
@@ -571,7 +555,7 @@ def identify(observations: Sequence[Observation], model: MomentModel, places: Pl
     unseen = FIT.common * known.error[at.scale][joints] / math.sqrt(max(1, len(joints)))
     if not is_relative and np.all(solution.error[at.scale][joints] > unseen):
         raise DataError("the weight shows no common factor: hang a heavier one, or hold it with a horizontal forearm")
-    _check_known(solution.hidden, len(observations), down[-1], model)
+    _check_known(solution.hidden, len(observations), model)
     unknowns, error = solution.unknowns, solution.error
     moments, scale = unknowns[at.moment], np.exp(unknowns[at.scale])
     _check_scales(moments, scale, down[-1], model)
@@ -599,13 +583,16 @@ def identify(observations: Sequence[Observation], model: MomentModel, places: Pl
     )  # fmt: skip
 
 
-def _check_known(hidden: np.ndarray, count: int, direction: Vector, model: MomentModel) -> None:
+def _check_known(hidden: np.ndarray, count: int, model: MomentModel) -> None:
     """Raise DataError that names what is missing if `count` poses do not show `hidden` (count,) that others would."""
     upright = model.down(Tilt.of(SIDES[0]))  # what shows only while the base leans needs no pose
-    missing = hidden[: layout_of(model).offset.stop] & shown_by(model, model.suggested, upright)
+    poses, known = model.suggested, _before(model)
+    shown = (_sensitivity(poses, upright, model.moments, model) * known) ** 2
+    missing = hidden[: len(known)] & (np.sqrt(shown.sum(axis=(0, 1))) > SHOWS.shown * math.sqrt(len(poses)))
     if np.any(missing):
         names = ", ".join(name for name, is_missing in zip(_names(model), missing, strict=False) if is_missing)
-        pose = missing_pose(missing, direction, model)
+        best = np.degrees(poses[int(np.argmax((shown * missing).sum(axis=(1, 2))))])
+        pose = f"[{', '.join(f'{angle:.0f}' for angle in best)}] degrees"
         raise DataError(f"{count} poses do not show {names}: add the pose {pose}")
 
 

@@ -55,7 +55,6 @@ class PoseChoice:
     most_upwards: float = 0.3  #: sine of the largest angle above the horizontal, of links 3 and 4
     effort_share: float = 0.85  #: of max_effort that a pose may need
     deviations: float = 2.0  #: of the expected torque, that a pose must leave room for; less where none does
-    least_deviation: float = 1e-9  #: Nm
     usual_friction: float = 0.5  #: Nm, until it is measured
     waypoints: int = 4  #: of the way to a pose, at which the motors must hold the arm too
     first_edge: float = 0.1  #: rad in addition, at the first pose
@@ -177,7 +176,7 @@ class Itinerary:
         mean, deviation = tour.guess.torques(ways.reshape(-1, poses.shape[1]), tour.down)
         slide = np.where(tour.friction, tour.friction, CHOICE.usual_friction)
         most = CHOICE.effort_share * np.array(self.limits.max_effort) - slide
-        room = (most - np.abs(mean)) / np.maximum(deviation, CHOICE.least_deviation)
+        room = (most - np.abs(mean)) / deviation
         return np.asarray(room.min(axis=1).reshape(len(ways), -1).min(axis=0))
 
 
@@ -319,7 +318,7 @@ class Tour:
         if (moved := angle_between(tilt.direction, self._first_tilt.direction)) > MAX_TILT:
             return f"the trunk tilted by {moved:.2f} rad during the measurement, the limit is {MAX_TILT:g}"
         tracker, most = self._tracker, MAX_ERROR
-        joints = zip(self._limits.joint_names, tracker.error, tracker.speed, tracker.vibrations, strict=True)
+        joints = zip(self._limits.joint_names, tracker.error, tracker.vibration.speed, tracker.vibrations, strict=True)
         for name, behind, speed, vibrations in joints:
             if not abs(behind) <= most:
                 return f"{name}: {abs(behind):.2f} rad off its path, the limit is {most:g}{self._because(HAND)}"

@@ -216,7 +216,7 @@ class Tracker:
     saturated: (n,) s for which each joint has wanted more than its `max_effort`.
     error: (n,) rad by which the arm is behind its path.
     correction: (n,) Nm, what the controller added to gravity and friction in the last step.
-    lowered: how often gains were lowered because motors vibrated.
+    vibration: of the motors. lowered: how often gains were lowered because motors vibrated.
     vibrations: (n,) how often each joint's motor has vibrated under the lowest gains.
     """
 
@@ -228,7 +228,7 @@ class Tracker:
         self.correction = np.zeros(count)
         self.lowered = 0
         self.vibrations = np.zeros(count)
-        self._vibration = Vibration(count)
+        self.vibration = Vibration(count)
         self._frequency = min(TRACKER.max_frequency, TRACKER.frequency_per_rate * rate)  # rad/s
         self._calm = 0.0  # s left to calm down
         self._filter = np.zeros((TRACKER.filter_order, count))  # Nm, what each filter passes
@@ -284,11 +284,6 @@ class Tracker:
         return self._effort
 
     @property
-    def speed(self) -> np.ndarray:
-        """The mean speeds (n,) of the joints in rad/s, without vibration."""
-        return self._vibration.speed
-
-    @property
     def fastest(self) -> float:
         """The speed in rad/s at which the arm may be moved.
 
@@ -301,7 +296,7 @@ class Tracker:
     def _watch_vibration(self, dt: float, velocity: Vector) -> None:
         """Lower the gains if a motor vibrates, without a step of what they hold; velocity: (n,) rad/s."""
         self._calm = max(0.0, self._calm - dt)
-        vibrates = self._vibration.step(dt, velocity)
+        vibrates = self.vibration.step(dt, velocity)
         if self._calm or not vibrates.any():
             return
         self.vibrations += vibrates & (self._frequency <= TRACKER.least_frequency)
@@ -311,7 +306,7 @@ class Tracker:
         self._frequency, self._calm, self.lowered = lower, TRACKER.calm, self.lowered + 1
         self._integral += (1.0 - left) * self._filter[-1]
         self._filter *= left
-        self._vibration.forget()
+        self.vibration.forget()
 
     def _compensate_friction(self, dt: float, heading: np.ndarray, speed_error: np.ndarray) -> None:
         """Compensate friction by and by towards `heading` (n,) rad/s, and no further in a joint that is ahead."""
