@@ -47,9 +47,8 @@ export class ArmCard {
     this.appeared = -Infinity; // ms, since when
     this.find(".enable").addEventListener("click", () => actions.enable(this));
     this.find(".look").addEventListener("click", () => this.look());
-    this.find(".clear").addEventListener("click", () => actions.send({ do: "clear_fault", arm: name }));
-    this.find(".resume").addEventListener("click", () => actions.send({ do: "resume", arm: name }));
-    this.find(".home").addEventListener("click", () => actions.send({ do: "bring_home", arm: name }));
+    for (const [part, kind] of Object.entries({ clear: "clear_fault", resume: "resume", home: "bring_home" }))
+      this.find(`.${part}`).addEventListener("click", () => actions.send({ do: kind, arm: name }));
     this.find(".down").addEventListener("click", () => actions.down(name));
     this.find(".weigh").addEventListener("click", () => actions.weigh(this));
     this.find(".carry").addEventListener("click", () => actions.carry(this, this.weighed));
@@ -84,10 +83,6 @@ export class ArmCard {
 
   get state() {
     return this.root.dataset.state;
-  }
-
-  get moves() {
-    return this.root.hasAttribute("data-moves");
   }
 
   // State, mode and support in one line.

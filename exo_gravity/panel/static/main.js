@@ -196,7 +196,7 @@ function showBar() {
   while (chips.children.length < cards.size) chips.append(Object.assign(document.createElement("li"), { className: "badge" }));
   [...cards.values()].forEach((card, n) => {
     chips.children[n].dataset.state = card.state;
-    chips.children[n].toggleAttribute("data-moves", card.moves);
+    chips.children[n].toggleAttribute("data-moves", card.root.hasAttribute("data-moves"));
     write(chips.children[n], card.summary());
   });
   // Red while it can do something; pressed, it always asks the arms.
@@ -219,7 +219,7 @@ function showSource() {
   const place = byId("source");
   place.hidden = !all.length;
   place.dataset.source = sources.has("simulated") ? "simulated" : sources.has("unknown") ? "unknown" : "real";
-  const each = all.map((card) => t("source.of", card.headText(), t(`source.${card.source}`)));
+  const each = all.map((card) => `${card.headText()}: ${t(`source.${card.source}`)}`);
   write(place, sources.size === 1 ? t(`source.${place.dataset.source}`) : each.join(", "));
 }
 

@@ -37,10 +37,8 @@ export class Sections {
       this.applied = this.applied.then(apply, apply); // in turn: every arm ends with the wearer who was given last
     });
     byId("trial-start").addEventListener("click", () => send({ do: "trial", name: byId("trials").value }));
-    byId("trial-stop").addEventListener("click", () => send({ do: "stop_trial" }));
-    byId("record").addEventListener("click", () => send({ do: "record" }));
-    byId("record-stop").addEventListener("click", () => send({ do: "stop_recording" }));
-    byId("save").addEventListener("click", () => send({ do: "save" }));
+    const kinds = { "trial-stop": "stop_trial", record: "record", "record-stop": "stop_recording", save: "save" };
+    for (const [id, kind] of Object.entries(kinds)) byId(id).addEventListener("click", () => send({ do: kind }));
     byId("show").addEventListener("click", () => this.showParameters());
   }
 
@@ -91,7 +89,7 @@ export class Sections {
 
   show(state, operates) {
     const running = ["running", "reporting"].includes(state.trial.phase);
-    for (const id of ["save"]) byId(id).disabled = !operates;
+    byId("save").disabled = !operates;
     const cards = [...this.cards.values()];
     byId("trial-start").disabled = !operates || running || !cards.every((card) => card.state === "active");
     byId("trial-stop").disabled = !operates || state.trial.phase !== "running";

@@ -115,7 +115,7 @@ function faultOf(arm, state, isSimulated) {
     const key = has(`fault.${code}`) ? code : "unknown";
     const [joint] = list(bridge["fault joint"]);
     const why = t(`fault.${key}`);
-    found.push({ why: joint ? t("fault.at", jointText(arm, joint), why) : why, todo: t(`do.${key}`) });
+    found.push({ why: joint ? `${jointText(arm, joint)}: ${why}` : why, todo: t(`do.${key}`) });
   }
   if (code === "command_withdrawn" && reasonText(state.compensator)) found.push({ why: reasonText(state.compensator) });
   const cause = state.cause && CAUSED.includes(code) ? causeText(state.cause) : "";
