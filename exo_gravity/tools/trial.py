@@ -40,14 +40,12 @@ def _run(options: argparse.Namespace, params: Path, clip: video.Clip | None, con
     """Run and report a trial; return the exit code. Raises ExoGravityError."""
     from exo_gravity.lab.bag.reader import read_bag
     from exo_gravity.lab.report import trial_report
-    from exo_gravity.lab.trial.run import Trial, check_bridges, is_guided, run_trial
+    from exo_gravity.lab.trial.run import Trial, check_bridges, run_trial
 
     path, script = read_script(options.name)
     session, now = Session(options.subject, options.protocol, options.note, version()), datetime.now()
     folder = Path(options.output).resolve() / session.folder(now) / f"{script.name}_{now:%Y%m%d_%H%M%S}"
-    guided = options.attach == "guided" if options.attach else is_guided(params)
-    if not options.attach:
-        check_bridges(params, options.offline)
+    guided = options.attach == "guided" if options.attach else check_bridges(params, options.offline)
     trial = Trial(path, script, None if options.attach else params, guided, session, folder)
     tell: Callable[..., None] = _print_json if options.attach else lambda **values: None
     stopped = stop_on_signals()

@@ -84,7 +84,7 @@ def test_a_real_arm_must_have_held_for_half_of_each_hold_of_the_script(found, du
 def test_only_holds_of_a_minute_are_judged_by_their_rate_and_a_simulator_makes_a_guide_needless():
     demo, poses = (analysed(bag_with(1), read_script(name)[1], False, "")[0] for name in ("demo", "thirteen_poses"))
     assert (demo.criteria.max_rate, poses.criteria.max_rate) == (math.inf, pytest.approx(math.radians(0.2) / 60))
-    assert running.is_guided(CONFIG / "exo.yaml") and not running.is_guided(CONFIG / "sim_both.yaml")
+    assert [running.check_bridges(CONFIG / name, True) for name in ("exo.yaml", "sim_both.yaml")] == [True, False]
 
 
 # Offline

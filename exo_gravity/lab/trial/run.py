@@ -243,13 +243,10 @@ RECORDER_TIMEOUT = 10.0  # s without a line from the recorder
 LONG_GAP = 50.0  # ms; a simulated device loses time after such a stall
 
 
-def is_guided(params: Path) -> bool:
-    """Return whether a person performs the script, because the parameter file has no simulator."""
-    return not any(node.endswith("/simulator") for node in load(params))
-
-
-def check_bridges(params: Path, is_offline: bool) -> None:
+def check_bridges(params: Path, is_offline: bool) -> bool:
     """Check that a parameter file has a can_bridge, whose arm a trial follows, and that its nodes can start.
+
+    Returns whether a person performs the script, because the file has no simulator.
 
     is_offline: none does, so that another can_bridge may hold the bus. Raises ParameterError, BusError.
     """
@@ -258,6 +255,7 @@ def check_bridges(params: Path, is_offline: bool) -> None:
         expected = f"a file with a can_bridge, whose arm a trial follows; it has {', '.join(nodes)}"
         raise ParameterError("params", str(params), expected)
     check_nodes(nodes) if is_offline else check_start(nodes)
+    return not any(node.endswith("/simulator") for node in nodes)
 
 
 @dataclass(frozen=True)
