@@ -298,7 +298,7 @@ def test_page_rows_figures_and_terminal_say_where_the_numbers_come_from(page_of,
     monkeypatch.setattr(html, "saved", lambda *given: stamped.append(given[2]) or b"")
     report = analyse(made.bag_of(WHOLE, parameters={"/right/can_bridge": BRIDGE.format(*bridge)}))
     text = page_of(report).text
-    assert text.index(SAID[source]) < text.index(report.held) and f"source: {source}" in printed(report)
+    assert text.index(SAID[source]) < text.index("It held") and f"source: {source}" in printed(report)
     assert {row["source"] for row in csv_rows(tmp_path / "holds.csv")} == {source}
     assert set(report.bag.columns()["source"]) == {source} and set(stamped) == {STAMPS[Source(source)]}
 

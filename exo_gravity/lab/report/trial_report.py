@@ -126,21 +126,17 @@ class Report:
         """0: held. 1: did not hold. 2: some of the recording could not be read."""
         return 2 if self.bag.problems else int(bool(self.failures))
 
-    @property
-    def held(self) -> str:
-        """The verdict on arms that held, which covers no more than was recorded."""
-        if self.bag.problems:
-            return "It held, as far as the recording could be read."
-        if self.trouble:
-            return f"It held until the trial ended early: {self.trouble}."
-        return "It held, as far as it was recorded." if self.bag.is_partial else "It held."
-
     @cached_property
     def verdict(self) -> tuple[str, bool]:
         """The first sentences of the report, and whether they are good news: a bad event comes first."""
         bad, moved, event = max((event for arm in self.arms for event in _events(self, *arm)), default=(False, 0.0, ""))
-        early = f" The trial ended early: {self.trouble}." if self.trouble else ""
-        held = f"It did not hold.{early}" if self.failures else self.held
+        held = "It held, as far as it was recorded." if self.bag.is_partial else "It held."
+        if self.failures:
+            held = f"It did not hold.{f' The trial ended early: {self.trouble}.' if self.trouble else ''}"
+        elif self.bag.problems:
+            held = "It held, as far as the recording could be read."
+        elif self.trouble:
+            held = f"It held until the trial ended early: {self.trouble}."
         first = f"{event[:1].upper()}{event[1:]}."
         if bad:
             return f"{first} {held if self.failures else held.replace('It ', 'Otherwise it ', 1)}", False
