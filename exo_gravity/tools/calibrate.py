@@ -133,11 +133,9 @@ def _run(options: argparse.Namespace) -> int:
     command: str = options.command
     check_output(options.output)
     if command == NEW:
-        from exo_gravity.lab.calibration.new import NewArm, write_new
+        from exo_gravity.lab.calibration.new import write_new
 
-        notes = write_new(
-            NewArm(**{name: getattr(options, name) for name in NewArm.__dataclass_fields__}), options.output
-        )
+        notes = write_new(options)
         print(*notes, f"Written: {options.output}; MEASURE in it marks what is still to be measured", sep="\n")
         return 0
     if command == ACCEPTANCE:

@@ -276,10 +276,13 @@ def temperatures(observations: Sequence[Observation]) -> np.ndarray:
     return np.array(given, dtype=float)
 
 
-def solve(rows: Rows, known: Known, effort: np.ndarray, spread: np.ndarray, reach: float = math.inf) -> Solution:
+def solve(
+    rows: Rows, known: Known, effort: np.ndarray, spread: np.ndarray, reach: float = math.inf, steps: int = FIT.steps
+) -> Solution:
     """Return what explains the effort (m, n) in Nm; spread: (m, n) Nm, its standard error as the poses state it.
 
     reach: standard errors, from which on a residual counts less: its weight falls as in Cauchy's distribution.
+    steps: of the joints' factors, and of the weights; with one, the stated errors count as they are.
     """
     at, unknowns, sigma, weight = rows.layout, known.start, spread, np.ones_like(effort)
     anchor = np.vstack((np.diag(1.0 / known.error), known.product))
@@ -294,7 +297,7 @@ def solve(rows: Rows, known: Known, effort: np.ndarray, spread: np.ndarray, reac
         scaled = by_unknowns(values) * known.error
         return known.error[:, None] * np.linalg.inv(scaled.T @ scaled) * known.error
 
-    for _ in range(FIT.steps):
+    for _ in range(steps):
         bounds = known.least, np.inf
         unknowns = least_squares(off, unknowns, by_unknowns, bounds, x_scale=known.error, max_nfev=FIT.most).x
         covariance = covariance_at(unknowns)
@@ -307,10 +310,7 @@ def solve(rows: Rows, known: Known, effort: np.ndarray, spread: np.ndarray, reac
         usual = spread * np.sqrt(np.maximum((squares + common) / (freedom + FIT.pooling), FIT.least_factor))
         sigma = np.hypot(usual, residual / reach)
         weight = (usual / sigma) ** 2
-    # A turn that is fitted may seem to show what the poses as measured do not: M1, of a joint whose axis is vertical.
-    measured = unknowns.copy()
-    measured[at.tilt], measured[at.turn] = 0.0, 0.0
-    hidden = np.diag(covariance_at(measured)) > FIT.hidden * known.error**2
+    hidden = np.diag(covariance) > FIT.hidden * known.error**2
     hidden[at.angle.start :] = False  # what is known of these before is true of every arm
     return Solution(unknowns, covariance, hidden, residual, held_out, usual, freedom)
 

@@ -5,11 +5,11 @@ What the URDF and the motors' records tell is filled in: limits, torques, where 
 can tell, signs, zeros and torque scales, is marked MEASURE. The file is read back as the nodes read it.
 """
 
+import argparse
 import json
 import math
 import re
 from collections.abc import Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import NamedTuple
 
@@ -36,40 +36,13 @@ PLAUSIBLE_ANGLE = 2.1 * math.pi  # rad; robots whose joints turn both ways have 
 PLAIN = re.compile(r"[A-Za-z][\w./-]*", re.ASCII)
 
 
-@dataclass(frozen=True)
-class NewArm:
-    """What the user says of an arm. Raises ParameterError."""
-
-    urdf: str  #: path of the URDF
-    motors: Sequence[str]  #: (n,) types
-    ids: Sequence[int]  #: (n,) CAN IDs
-    joints: Sequence[str] = ()  #: (n,) in this order; () for all turning joints in the order of the URDF
-    hand: str = ""  #: the link that holds a load, '' for none
-    side: str = "right"
-    channel: str = "can0"
-    fd: bool = False  #: whether the bus is CAN FD
-    simulate: bool = False  #: whether the file gets a simulated device, on a simulated bus
-
-    @property
-    def bus(self) -> str:
-        """The bus as YAML."""
-        fd = "fd: true" * self.fd
-        if self.simulate:
-            return f"{{{', '.join(filter(None, (SIMULATED_BUS, fd)))}}}}}"
-        options = f", options: {{{fd}}}" * self.fd
-        return f"{{interface: socketcan, channel: {_plain(self.channel)}{options}}}"
-
-    @property
-    def file(self) -> str:
-        """The URDF as nodes find it, wherever they are started."""
-        return self.urdf if self.urdf.startswith("package://") else str(Path(self.urdf).absolute())
-
-    def __post_init__(self) -> None:
-        every_family()  # those of other distributions, too
-        fit = [name for name, spec in MOTORS.items() if spec.can_fd or not self.fd]
-        for motor in self.motors:
-            if motor not in fit:
-                raise ParameterError("motors", motor, f"one of {', '.join(fit)}{' on CAN FD' * self.fd}")
+def _bus(options: argparse.Namespace) -> str:
+    """Return the bus as YAML."""
+    fd = "fd: true" * options.fd
+    if options.simulate:
+        return f"{{{', '.join(filter(None, (SIMULATED_BUS, fd)))}}}}}"
+    options_of_bus = f", options: {{{fd}}}" * options.fd
+    return f"{{interface: socketcan, channel: {_plain(options.channel)}{options_of_bus}}}"
 
 
 class JointRange(NamedTuple):
@@ -153,8 +126,18 @@ def on_stops(arm: UrdfArm, names: Sequence[str], home: np.ndarray) -> list[str]:
     return [f"by its URDF the arm hangs at {angles} degrees, if the root link's z axis points up: compare"]
 
 
-def write_new(new: NewArm, output: Path) -> list[str]:
-    """Write the parameter file; return what a person should know, a sentence each. Raises ParameterError."""
+def write_new(new: argparse.Namespace) -> list[str]:
+    """Write the parameter file; return what a person should know, a sentence each. Raises ParameterError.
+
+    new: urdf, its path; motors (n,), types; ids (n,), CAN IDs; joints (n,) in this order, () for all turning joints in
+    the order of the URDF; hand, the link that holds a load, '' for none; side; channel of the bus, and whether it is
+    CAN FD (fd); whether the file gets a simulated device, on a simulated bus (simulate); output.
+    """
+    every_family()  # those of other distributions, too
+    fit = [name for name, spec in MOTORS.items() if spec.can_fd or not new.fd]
+    for motor in new.motors:
+        if motor not in fit:
+            raise ParameterError("motors", motor, f"one of {', '.join(fit)}{' on CAN FD' * new.fd}")
     text = read_urdf(new.urdf)
     known = turning_joints(text)
     names = list(new.joints or known)
@@ -179,13 +162,13 @@ def write_new(new: NewArm, output: Path) -> list[str]:
             notes.append(f"{name}: gravity takes up to {most:.1f} Nm of it, max_effort is {effort:g} Nm")
     worn = [0, 0, *(n for n, length in enumerate(arm.length, start=1) if length > SEGMENT)][-2:]
     text = _file(new, names, ranges, efforts, needed.tolist(), home.round(3).tolist(), worn)
-    read_arm(read(text, str(output)), f"/{new.side}")
-    output.write_text(text, encoding="utf-8")
+    read_arm(read(text, str(new.output)), f"/{new.side}")
+    new.output.write_text(text, encoding="utf-8")
     return notes
 
 
 def _file(
-    new: NewArm,
+    new: argparse.Namespace,
     names: Sequence[str],
     ranges: Sequence[JointRange],
     efforts: Sequence[float],
@@ -200,7 +183,9 @@ def _file(
     count, simulator = len(names), ""
     timeouts = [DAMIAO_TIMEOUT if MOTORS[motor].family == "damiao" else 0.0 for motor in new.motors]
     edges = [edge.inside(angle) for edge, angle in zip(ranges, home, strict=True)]
-    urdf = f"{{file: {json.dumps(new.file, ensure_ascii=False)}, hand: {json.dumps(new.hand, ensure_ascii=False)}}}"
+    # As nodes find it, wherever they are started.
+    file = new.urdf if new.urdf.startswith("package://") else str(Path(new.urdf).absolute())
+    urdf = f"{{file: {json.dumps(file, ensure_ascii=False)}, hand: {json.dumps(new.hand, ensure_ascii=False)}}}"
     start = "autostart: false  # an operator arms it\n    rate: 250.0"
     if new.simulate:
         start = (
@@ -214,7 +199,7 @@ def _file(
     side: {new.side}
     urdf: {urdf}
     joint_names: {_row(names)}
-    can: {new.bus}
+    can: {_bus(new)}
     motor: {_row(new.motors)}
     can_id: {_row(new.ids)}
     direction: {_row([1] * count)}
@@ -230,7 +215,7 @@ def _file(
   ros__parameters:
     joint_names: {_row(names)}
     {start}
-    can: {new.bus}
+    can: {_bus(new)}
     motor: {_row(new.motors)}
     can_id: {_row(new.ids)}
     direction: {_row([1] * count)}  # MEASURE: 1 or -1, so that a positive angle is that of the URDF

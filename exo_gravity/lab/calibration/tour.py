@@ -99,7 +99,7 @@ class TorqueGuess:
             hung = np.array([model.load(one.load_mass, one.load_lever) for one in seen])
             rows = rows_at(model, theta, direction)._replace(load=hung)
             unexplained = np.hypot(GUESS.unexplained, GUESS.share * effort)
-            fit = solve(rows, known, effort, np.hypot(spread, unexplained))
+            fit = solve(rows, known, effort, np.hypot(spread, unexplained), steps=1)
             self._unknowns, self._covariance = fit.unknowns, fit.covariance
         self.moments = self._unknowns[self._at.moment] + model.load(*load)
         self._share = np.exp(-self._unknowns[self._at.scale])  # commanded torque by torque
@@ -119,9 +119,9 @@ class TorqueGuess:
         """
         rows = rows_at(self.model, theta, np.broadcast_to(direction, (len(theta), 3)))
         rows = rows._replace(load=rows.load + self.model.load(*self._load))
-        jacobian = rows.jacobian(self._unknowns)
+        mean, jacobian = rows.predicted(self._unknowns), rows.jacobian(self._unknowns)
         variance = np.einsum("mnt,mnt->mn", jacobian @ self._covariance, jacobian)
-        return rows.predicted(self._unknowns), np.sqrt(np.maximum(variance, 0.0))
+        return mean, np.sqrt(variance)
 
     def matrix(self, theta: Sequence[float]) -> np.ndarray:
         """Return the mass matrix (n, n) in kg m^2 of the file's arm, in the torque that each motor is commanded.
