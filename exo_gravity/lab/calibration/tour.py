@@ -225,6 +225,7 @@ MAX_ERROR = 0.12  # rad between a joint and the slow reference
 FASTEST = 1.0  # rad/s of a joint; a light joint that leaves its friction reaches 0.5
 MAX_VIBRATIONS = 10  # of a motor, under the lowest gains
 MAX_CORRECTION = 0.5  # Nm, of the controllers, in addition to what is unknown of weight and friction
+SOFT = 1.5  # times both, under gains that were lowered because motors vibrated
 DEVIATIONS = 3.0  # of the expected torque
 UNKNOWN_FRICTION = 1.0  # Nm, until it is measured
 PERSISTENCE = 0.25  # s for which a torque must be unexplained
@@ -317,7 +318,7 @@ class Tour:
             return f"the next pose was not chosen within {LONGEST_CHOICE:g} s: is this computer too busy?"
         if (moved := angle_between(tilt.direction, self._first_tilt.direction)) > MAX_TILT:
             return f"the trunk tilted by {moved:.2f} rad during the measurement, the limit is {MAX_TILT:g}"
-        tracker, most = self._tracker, MAX_ERROR
+        tracker, most = self._tracker, MAX_ERROR * (SOFT if self._tracker.lowered else 1.0)
         joints = zip(self._limits.joint_names, tracker.error, tracker.vibration.speed, tracker.vibrations, strict=True)
         for name, behind, speed, vibrations in joints:
             if not abs(behind) <= most:
@@ -334,7 +335,7 @@ class Tour:
             most = f"max_effort = {self._most[i]:g} Nm"
             return f"{self._limits.joint_names[i]}: saturated: the pose needs more than {most}{self._because()}"
         torque, slide = self._tracker.correction, np.where(self.friction, 0.5 * self.friction, UNKNOWN_FRICTION)
-        limit = MAX_CORRECTION + DEVIATIONS * self._uncertain + slide
+        limit = MAX_CORRECTION * (SOFT if self._tracker.lowered else 1.0) + DEVIATIONS * self._uncertain + slide
         self._unexplained = np.where(np.abs(torque) > limit, self._unexplained + dt, 0.0)
         for i in np.flatnonzero(self._unexplained > PERSISTENCE):
             beyond = f"{torque[i]:.2f} Nm beyond its weight and friction, the limit is {limit[i]:.2f}"

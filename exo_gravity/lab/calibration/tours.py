@@ -71,9 +71,7 @@ from exo_gravity.lab.inputs.node_checks import check_start
 from exo_gravity.lab.inputs.parameter_file import load, text_of
 from exo_gravity.lab.processes import Launcher, asking_on_terminal, stop_on_signals
 
-KEPT = ("can_bridge", "simulator")  # the arm's nodes that run during a calibration, with the shared /imu
 REFRESH_PERIOD = 0.1  # s, of what the person is shown
-STOPPED = "stopped by Ctrl-C"
 
 Say = Callable[[Any], None]
 
@@ -139,7 +137,7 @@ def tour_parameters(params: Path, arm: ConfiguredArm, changes: Mapping[str, Any]
     bridge, compensator = arm.can_bridge, arm.compensator
     if list(compensator["joint_names"]) != list(bridge["joint_names"]):
         raise ParameterError("joint_names", compensator["joint_names"], f"{bridge['joint_names']}")
-    kept = ("/imu", *(f"{arm.namespace}/{name}" for name in KEPT))
+    kept = ("/imu", *(f"{arm.namespace}/{name}" for name in ("can_bridge", "simulator")))
     nodes = {node: values for node, values in load(params).items() if node in kept}
     simulator = nodes.get(f"{arm.namespace}/simulator")
     if simulator and (mass := changes.get("tour.load_mass")):
@@ -188,7 +186,7 @@ def run_tour(options: argparse.Namespace, nodes: Mapping[str, Any], say: Say) ->
         node, code = dead
         tour.trouble = f"{node.lstrip('/')} ended with exit code {code}: {last_errors.get(node, 'see the log')}"
     elif not tour.done:
-        tour.trouble = tour.trouble or STOPPED
+        tour.trouble = tour.trouble or "stopped by Ctrl-C"
     if launcher.maybe_powered:
         powered = f"the motors of {', '.join(launcher.maybe_powered)} may still be powered: cut their supply"
         tour.trouble = f"{tour.trouble}; {powered}" if tour.trouble else powered
