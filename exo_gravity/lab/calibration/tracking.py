@@ -5,14 +5,15 @@ All joints sweep through a pose there and back. At the same angle the torque of 
 that of the way back gravity minus friction.
 
 The arm follows a slow reference by expected gravity torque, friction, and a PID controller in joint space. Its output
-is an acceleration, which the arm's approximate mass matrix turns into torques: so all joints have one natural
-frequency, however they are coupled.
+is an acceleration, which the arm's approximate mass matrix turns into torques: so each joint has the natural
+frequency that it is given, however they are coupled.
 
 Behind an elastic joint the links no longer hold the rotor: above their resonance the controller moves the rotor alone,
 which has 1 to 20 % of the inertia that the gains are for. An AK60-6 on 1,000 Nm/rad rings at 170 Hz, beyond what 250 Hz
 sample. Nobody knows that before the first tour. So the tracker begins with the gains of a rigid arm, which pass
-Stribeck friction best. Each time that a motor vibrates, it lowers the gains, and the speed with them. Lowered gains
-pass a low-pass filter, which leaves nothing of them at the rotor's frequencies.
+Stribeck friction best. When a motor vibrates, it lowers the gains of all joints, then further those of each whose motor
+still does, and the speed with them. Lowered gains pass a low-pass filter, which leaves nothing of them at the rotor's
+frequencies.
 """
 
 import math
@@ -229,7 +230,7 @@ class Tracker:
         self.lowered = 0
         self.vibrations = np.zeros(count)
         self.vibration = Vibration(count)
-        self._frequency = min(TRACKER.max_frequency, TRACKER.frequency_per_rate * rate)  # rad/s
+        self._frequency = np.full(count, min(TRACKER.max_frequency, TRACKER.frequency_per_rate * rate))  # rad/s
         self._calm = 0.0  # s left to calm down
         self._filter = np.zeros((TRACKER.filter_order, count))  # Nm, what each filter passes
         self._max_effort = np.array(max_effort)
@@ -290,20 +291,21 @@ class Tracker:
         It falls with lowered gains: so does the rate at which the integral part follows a torque that differs from what
         was expected.
         """
-        share = self._frequency / TRACKER.soft_frequency if self.lowered else 1.0
+        share = float(self._frequency.min()) / TRACKER.soft_frequency if self.lowered else 1.0
         return max(TRACKER.slowest, min(1.0, share) * MOTION.speed)
 
     def _watch_vibration(self, dt: float, velocity: Vector) -> None:
-        """Lower the gains if a motor vibrates, without a step of what they hold; velocity: (n,) rad/s."""
+        """Lower the gains where a motor vibrates, without a step of what they hold; velocity: (n,) rad/s."""
         self._calm = max(0.0, self._calm - dt)
-        vibrates = self.vibration.step(dt, velocity)
+        vibrates, present = self.vibration.step(dt, velocity), self._frequency
         if self._calm or not vibrates.any():
             return
-        self.vibrations += vibrates & (self._frequency <= TRACKER.least_frequency)
-        softer = TRACKER.softer * self._frequency if self.lowered else TRACKER.soft_frequency
-        lower = max(TRACKER.least_frequency, min(softer, self._frequency))
-        left = (lower / self._frequency) ** 2
-        self._frequency, self._calm, self.lowered = lower, TRACKER.calm, self.lowered + 1
+        self.vibrations += vibrates & (present <= TRACKER.least_frequency)
+        # At first those of all joints: the others are about to.
+        softer = np.where(vibrates, TRACKER.softer * present, present) if self.lowered else TRACKER.soft_frequency
+        self._frequency = np.maximum(TRACKER.least_frequency, np.minimum(softer, present))
+        left = (self._frequency / present) ** 2
+        self._calm, self.lowered = TRACKER.calm, self.lowered + 1
         self._integral += (1.0 - left) * self._filter[-1]
         self._filter *= left
         self.vibration.forget()
@@ -318,8 +320,8 @@ class Tracker:
 
     def _controlled(self, dt: float, speed_error: np.ndarray, expected: Torque, matrix: np.ndarray) -> Torque:
         frequency, weakest = self._frequency, float(np.linalg.eigvals(matrix).real.min())
-        stiff = frequency**2 * (matrix @ self.error)
-        push = self._filtered(dt, stiff + 2.0 * frequency * (matrix @ speed_error))
+        root, stiff = np.sqrt(frequency), frequency * (matrix @ (frequency * self.error))
+        push = self._filtered(dt, stiff + 2.0 * root * (matrix @ (root * speed_error)))
         floor = TRACKER.floor * weakest * self.error * frequency**2
         integral = self._integral + TRACKER.integral_share * frequency * dt * (stiff + floor)
         torque = expected + self._slide + push + integral
@@ -332,7 +334,7 @@ class Tracker:
 
     def _filtered(self, dt: float, push: np.ndarray) -> np.ndarray:
         """Return `push` (n,) Nm, of lowered gains without what the rotor could vibrate with."""
-        passed, value = 1.0 - math.exp(-TRACKER.filtered_from * self._frequency * dt), push
+        passed, value = 1.0 - np.exp(-TRACKER.filtered_from * self._frequency * dt), push
         for stage in self._filter:
             stage += passed * (value - stage)
             value = stage
