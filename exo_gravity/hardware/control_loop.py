@@ -224,6 +224,7 @@ class ControlLoop:
         now = self._now()
         if (suspended := self._clock.suspended() - self._suspended) > SUSPENDED:
             self._suspended += suspended
+            self.safety.watch.require_sign_check()  # the motors may have lost their power meanwhile
             self.safety.trip(FaultCode.MOTOR_SILENT, f"the computer was suspended for {suspended:.0f} s", now)
         if now - self.attended > LONGEST_ABSENCE and self.safety.state in CARRYING:
             reason = f"no service and no timer of the node has run for {LONGEST_ABSENCE:g} s"

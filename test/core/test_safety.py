@@ -313,6 +313,10 @@ ROWS: dict[str, Sequence[Step]] = {
             (0.08, 0.0, True), (0.08, TURN, False), (0.2, 0.0, True), (0.2, -TURN, False), (0.4, 0.0, False),
         )
     },
+    "a loop that stood still for long leaves zeros in doubt": [
+        *let_down_by(FaultCode.COMMAND_STALE), stall(0.9), wait(), has(lambda arm: arm.machine.why_not_resumed == ""),
+        stall(1.1), wait(), see(words="zeros"),
+    ],
     **{
         f"the checks wait: {cause}": [spoil, enable, wait(2.0), see(State.CHECKING, words=words), ALL_OFF]
         for cause, (spoil, words) in {

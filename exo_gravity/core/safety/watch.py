@@ -5,8 +5,8 @@ Readings. After power-up a motor knows its angle modulo a turn of its rotor only
 40 at an AK80-9. So zeros and signs are proven while the arm hangs. A proof holds for as long as the angles are
 continuous, and that is judged here alone, whichever fault lets the arm down. They are no longer continuous when
 
-- a motor may have lost its power: it was silent for long enough to restart, or has come back from a shorter silence at
-  an angle that its velocity does not explain;
+- a motor may have lost its power: it was silent for long enough to restart, nobody looked for a while, or it has come
+  back from a shorter silence at an angle that its velocity does not explain;
 - an angle jumps, or a joint turns faster than `max_velocity`: an encoder that slips looks like a joint that is thrown;
 - angle and velocity contradict each other: a wrong `velocity_range` or sign, a frozen angle, a slow slip;
 - a motor reports an error;
@@ -62,6 +62,7 @@ class ContinuityLimits:
     #: `home_tolerance`
     restart: float = 0.1
     restart_off: float = 0.3  #: s, of motors that are off: only a person moves an arm that is down
+    pause: float = 1.0  #: s for which the loop stood still, and knows nothing; a busy computer makes less
     jump: float = 0.05  #: rad between two readings, in addition to what `max_velocity` allows
     #: s, time constant with which angle and integrated velocity forget their difference; a velocity that is wrong by
     #: half a code of an AK80-9 (0.012 rad/s) adds 0.024 rad
@@ -462,7 +463,7 @@ class ArmWatch:
             is_known = self.trusted or self.is_being_proven
             found += joint.read(now, dt, sample, self._now, is_held_back, restart, is_known)
             self.trusted &= joint.missed < READING.missed or now - sample.time <= restart
-        self.trusted &= not any(fault.code in BREAKS for fault in found)
+        self.trusted &= now - self._now <= CONTINUITY.pause and not any(fault.code in BREAKS for fault in found)
         self.samples = tuple([joint.sample for joint in self.joints])
         self.silent = [joint.is_silent for joint in self.joints]
         self.is_late = max([joint.missed for joint in self.joints]) >= READING.late
