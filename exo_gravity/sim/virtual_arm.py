@@ -139,6 +139,6 @@ class VirtualArm:
         """Deliver a reading of the trunk, which was taken at `taken` s, to compensator and safety machine."""
         now, gravity, turning = self.now, reading.gravity, reading.angular_velocity
         compensator.tilt.set_gravity(now, gravity, turning, now - taken)
-        self.safety.motion.follow(Tilt.of_gravity(self.device.side, gravity), compensator.tilt.overtaken)
+        self.safety.motion.follow(now, Tilt.of_gravity(self.device.side, gravity), compensator.tilt.overtaken)
         if reading.specific_force:
             compensator.motion.add(now, reading.specific_force, turning, now - taken)

@@ -247,7 +247,7 @@ def test_any_load_up_to_the_largest_moments_is_explained_in_any_pose_at_any_tilt
     for _ in range(100):
         theta, tilt = random.uniform(-1.6, 2.5, 4), Tilt.of(side, *random.uniform(-1.5, 1.5, 2))
         lighter = ArmModel.from_moments(ROBOT.length, random.uniform(0.0, 1.0, 4) * ROBOT.first_moment)
-        monitor.follow(tilt, None)
+        monitor.follow(0.0, tilt, None)
         low, high = monitor.explained(theta)
         torque = gravity_torque(lighter, theta, tilt.direction)
         assert np.all(np.array(low) - 1e-3 <= torque) and np.all(torque <= np.array(high) + 1e-3)
@@ -289,13 +289,13 @@ def test_only_what_gravity_and_permitted_additions_explain_is_no_fault(torque, l
     assert found < latest or found == latest == math.inf
 
 
-def test_a_torque_on_its_way_from_a_tilt_that_was_overtaken_is_no_fault_for_some_seconds() -> None:
+def test_a_torque_on_its_way_from_a_tilt_that_was_overtaken_is_no_fault_for_some_seconds_carried_or_not() -> None:
     before, lying = Tilt.of("left"), Tilt.of("left", math.radians(80.0), math.radians(-60.0))
     torque = gravity_torque(ROBOT, RAISED, before.direction)
-    for overtaken, fault_after in ((None, 0.0), (before, MOTION.guided)):
+    for overtaken, start, fault_after in ((None, 0.0, 0.0), (before, 0.0, MOTION.guided), (before, 60.0, 60.0)):
         monitor, now = MotionMonitor(WATCHED), 0.0
-        monitor.follow(lying, overtaken)
-        while not monitor.step(PERIOD, samples(RAISED), torque)[1]:
+        while now < start or (now < 90.0 and not monitor.step(PERIOD, samples(RAISED), torque)[1]):
+            monitor.follow(now, lying, None if now else overtaken)
             now += PERIOD
         assert fault_after <= now + PERIOD < fault_after + 0.2
 
@@ -303,7 +303,7 @@ def test_a_torque_on_its_way_from_a_tilt_that_was_overtaken_is_no_fault_for_some
 def test_a_torque_that_follows_a_bow_and_its_return_is_no_fault() -> None:
     monitor, bowed = MotionMonitor(WATCHED), gravity_torque(ROBOT, RAISED, Tilt.of("left", 0.8).direction)
     for pitch in (*np.linspace(0.0, 1.4, 50), *np.linspace(1.4, 0.0, 50)):  # the torque is still in the bow
-        monitor.follow(Tilt.of("left", pitch), Tilt.of("left") if pitch > 0.1 else None)
+        monitor.follow(0.0, Tilt.of("left", pitch), Tilt.of("left") if pitch > 0.1 else None)
     assert not any(monitor.step(PERIOD, samples(RAISED), bowed)[1] for _ in range(200))
 
 

@@ -125,7 +125,7 @@ def never_entered(seconds: float) -> Step:
 
 def leans(pitch: float, roll: float = 0.0) -> Step:
     """Tilt the trunk, in rad."""
-    return lambda arm: arm.machine.motion.follow(Tilt.of("right", pitch, roll), None)
+    return lambda arm: arm.machine.motion.follow(arm.now, Tilt.of("right", pitch, roll), None)
 
 
 SMOOTH = has(lambda arm: max(arm.steps) <= MAX_EFFORT_RATE * PERIOD * 1.0001)
@@ -316,6 +316,10 @@ ROWS: dict[str, Sequence[Step]] = {
     "a loop that stood still for long leaves zeros in doubt": [
         *let_down_by(FaultCode.COMMAND_STALE), stall(0.9), wait(), has(lambda arm: arm.machine.why_not_resumed == ""),
         stall(1.1), wait(), see(words="zeros"),
+    ],
+    "an arm that is carried on after stale efforts may wait for late ones again": [
+        carried, let(**TOO_LATE), until(State.FAULT), let(**FRESH), has(lambda arm: arm.machine.resume(arm.now)),
+        until(State.RAMPING_IN), let(effort_age=LATE), wait(0.08), see(State.RAMPING_IN, ""),
     ],
     **{
         f"the checks wait: {cause}": [spoil, enable, wait(2.0), see(State.CHECKING, words=words), ALL_OFF]

@@ -465,7 +465,7 @@ def test_what_mujoco_needs_of_any_chain_is_explained_in_any_pose_at_any_tilt(cou
     for _ in range(50):
         theta, (pitch, roll) = random.uniform(-3.0, 3.0, count), random.uniform(-1.0, 1.0, 2)
         tilt = Tilt.of(side, pitch, roll)
-        monitor.follow(tilt, None)
+        monitor.follow(0.0, tilt, None)
         low, high = monitor.explained(theta.tolist())
         torque = truth.torque(theta, 9.80665 * np.array(tilt.gravity_in_trunk))
         assert np.all(low - beside - 0.01 <= torque) and np.all(torque <= high + beside + 0.01)

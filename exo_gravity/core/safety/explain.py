@@ -79,25 +79,26 @@ class MotionMonitor:
         self.full = tuple(accumulate(load[::-1]))[::-1]
         self._axes, ways = (limits.axes, limits.ways) if limits.axes else PAPER
         self._moments = [plus(ZERO, way, torque) for way, torque in zip(ways, load, strict=False)]  # Nm
-        self._guided = 0.0  # s for which the torque may still be on its way from a tilt before
+        self._until = -math.inf  # s, until when the torque may still be on its way from a tilt before
         self._passed: list[Floats3] = []  # gravity meanwhile: the torque lies between what these need
         upright = Tilt.of(SIDES[0])
         self._gravity, self.trunk_tilt = self._down(upright), upright.axis_angle
         self._pose: Sequence[float] = ()  # rad, for which the range was computed
         self.reset()
 
-    def follow(self, tilt: Tilt, overtaken: Tilt | None) -> None:
-        """Take the tilt of the trunk; upright before the first one.
+    def follow(self, now: float, tilt: Tilt, overtaken: Tilt | None) -> None:
+        """Take the tilt of the trunk at `now` s; upright before the first one.
 
         overtaken: from which the torque is guided, if the trunk has turned (`TiltInput.overtaken`).
         """
         gravity, self.trunk_tilt = self._down(tilt), tilt.axis_angle
         if overtaken or not math.dist(gravity, self._gravity) <= MOTION.still:
             self._gravity, self._pose = gravity, ()
+        self._passed = self._passed if now <= self._until else []
         if overtaken:
-            self._passed = self._passed if self._guided else [self._down(overtaken)]
-            self._guided = MOTION.guided
-        if self._guided and all(dot(self._gravity, each) < MOTION.near for each in self._passed):
+            self._passed = self._passed or [self._down(overtaken)]
+            self._until = now + MOTION.guided
+        if self._passed and all(dot(self._gravity, each) < MOTION.near for each in self._passed):
             self._passed.append(self._gravity)
 
     def reset(self) -> None:
@@ -115,11 +116,10 @@ class MotionMonitor:
         asked = zip(effort, self._limits.max_command, strict=True)
         if not self._is_on or not all(abs(torque) <= most for torque, most in asked):
             return effort, None
-        self._guided = max(0.0, self._guided - dt)
         fastest = max([abs(joint.velocity) for joint in joints])
         pose = [joint.position for joint in joints]
         if not self._pose or not math.dist(pose, self._pose) <= MOTION.still:
-            self._pose, self._explained = () if self._guided else pose, self.explained(pose)
+            self._pose, self._explained = () if self._passed else pose, self.explained(pose)
         lowest, highest = self._explained
         self._slow = self._slow or list(effort)
         passed: list[float] = []
@@ -156,7 +156,7 @@ class MotionMonitor:
             half = math.sin(angle / 2.0)
             turn = product(turn, (half * axis[0], half * axis[1], half * axis[2], math.cos(angle / 2.0)))
             moments.append(rotated(turn, moment))
-        downs = (self._gravity, *self._passed) if self._guided else (self._gravity,)
+        downs = (self._gravity, *self._passed)
         lowest, highest = list[float](), list[float]()
         for n, axis in enumerate(axes):
             # -g . (axis x link) = (axis x g) . link
@@ -205,11 +205,11 @@ class StaleEfforts:
             self.are_used = False
             self._left = min(STALE.longest, self._left + STALE.recovery * dt)
             return None
-        self.count += not self.are_used
-        self.are_used, self.seen = True, now
         self._left = max(0.0, self._left - dt)
         self.why = f"efforts {1000.0 * age:.0f} ms old" + (", of a tilt that is late" if held else "")
         if self._left > 0.0 and age <= STALE.longest_age:
+            self.count += not self.are_used
+            self.are_used, self.seen = True, now
             return None
         self.are_used = False
         limit = f"{1000.0 * self._timeout:.0f} ms, or {1000.0 * STALE.longest:.0f} ms more for a moment"

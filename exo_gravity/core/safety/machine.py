@@ -82,7 +82,6 @@ class SafetyMachine:
         self.acted: dict[str, float] = {}
         self.damped: dict[str, float] = {}
         self.stale = StaleEfforts(limits.command_timeout)
-        self._stale_while_checking = StaleEfforts(limits.command_timeout)
         self._period = period
         count = len(limits.joint_names)
         self._none, self._commands = (0.0,) * count, (Send.COMMAND,) * count
@@ -155,8 +154,9 @@ class SafetyMachine:
             cause = f"{self.fault.code} has a cause to look for: then clear the fault and enable the arm"
             return Reason(Resume.HAS_CAUSE, cause)
         if not self.watch.trusted:
-            unsure = "zeros are no longer sure: let the arm hang, clear the fault, enable the arm"
-            return Reason(Resume.ZEROS_UNSURE, unsure)
+            return Reason(
+                Resume.ZEROS_UNSURE, "zeros are no longer sure: let the arm hang, clear the fault, enable the arm"
+            )
         return Reason(Resume.POSSIBLE, "")
 
     def confirm_pose(self, now: float) -> str:
@@ -266,7 +266,7 @@ class SafetyMachine:
 
         Efforts may be late as they may while the arm is carried, but not in the cycle in which the checks end.
         """
-        watch, limits, effort, stale = self.watch, self.limits, efforts.effort, self._stale_while_checking
+        watch, limits, effort, stale = self.watch, self.limits, efforts.effort, self.stale
         are_late = stale.step(self._now, self._dt, self._now - efforts.answered, efforts.held)
         missing = missing_for_a_start(limits, watch.samples, watch.fault, watch.trusted)
         if isinstance(missing, Fault):

@@ -14,7 +14,7 @@ import sys
 import threading
 import time
 from collections.abc import Callable
-from functools import wraps
+from functools import partial, wraps
 from typing import Any
 
 import rclpy
@@ -75,7 +75,7 @@ def _follow_gravity(node: Node, get_loop: Callable[[], ControlLoop | None], is_m
 
     def pass_on(now: float) -> None:
         if loop := get_loop():
-            loop.safety.motion.follow(tilt.at(now), tilt.overtaken)
+            loop.call(partial(loop.safety.motion.follow, now, tilt.at(now), tilt.overtaken))
 
     TiltSubscription(node, tilt, threading.Lock(), on_tilt=pass_on)
 
