@@ -181,9 +181,9 @@ class StaleEfforts:
     arm that moves on at 1 rad/s makes the torque wrong by 18 % of gravity's largest.
 
     are_used: whether the efforts are stale and still used.
-    count: how often they became stale.
+    count: how often stale ones were used.
     why: what was stale last.
-    seen: s, when they were last stale.
+    seen: s, when stale ones were last used.
     """
 
     def __init__(self, timeout: float) -> None:
