@@ -3,8 +3,9 @@
 
 `command.TRANSITIONS` has every transition, `watch.NEXT` those of a single motor.
 
-- CHECKING waits for the start gate (start.py), at most `enable_timeout`. If zeros are not trusted, the arm must hang, a
-  person must confirm it unless `start_pose` says that they have, and little torque may be asked for.
+- CHECKING waits for the start gate (start.py), at most `enable_timeout`. Its calm second passes before the arm is
+  enabled, too. If zeros are not trusted, the arm must hang, a person must confirm it unless `start_pose` says that they
+  have, and little torque may be asked for.
 - PROVING switches the motors on one by one (`SwitchingOn`). Each must show in its replies that it is on. If signs are
   not trusted, each joint is pushed gently, and must move the right way (`SignCheck`). Any fault, and `disable`, takes
   the push back without a step and without damping, and switches the motors off.
@@ -88,7 +89,7 @@ class SafetyMachine:
         #: the last hand on every command
         self.shaper = Shaper(limits, [motor.peak_damping for motor in motors] or [math.inf] * count)
         self.watch = ArmWatch(limits, period, motors)
-        self._since = self._calm_since = 0.0
+        self._since, self._calm_since = 0.0, math.inf
         self._now, self._dt = -math.inf, 0.0  # of the present cycle
         self._sent = self._off = Command.off(count)  # last sent to the motors
         self._descent = ArmDescent(0.0, self._none, self._none, self._none)
@@ -127,7 +128,6 @@ class SafetyMachine:
         if self.state is not State.DISABLED:
             return False
         self.waiting_for, self.refusal = Reason(Wait.REPLIES, "the first replies of the motors"), NO_REASON
-        self._calm_since = now
         self._on(StateEvent.ENABLE, now)
         return True
 
@@ -151,13 +151,11 @@ class SafetyMachine:
         if self.state is not State.FAULT or self.fault is None:
             return Reason(Resume.NO_FAULT, f"the arm is {self.state.value}, must be in fault")
         if not self.fault.code.is_resumable:
-            cause = f"{self.fault.code} has a cause to look for: then clear the fault and enable the arm"
-            return Reason(Resume.HAS_CAUSE, cause)
-        if not self.watch.trusted:
             return Reason(
-                Resume.ZEROS_UNSURE, "zeros are no longer sure: let the arm hang, clear the fault, enable the arm"
+                Resume.HAS_CAUSE, f"{self.fault.code} has a cause: look for it, clear the fault, enable the arm"
             )
-        return Reason(Resume.POSSIBLE, "")
+        unsure = "zeros are no longer sure: let the arm hang, clear the fault, enable the arm"
+        return Reason(Resume.POSSIBLE, "") if self.watch.trusted else Reason(Resume.ZEROS_UNSURE, unsure)
 
     def confirm_pose(self, now: float) -> str:
         """Take the operator's word that the arm hangs as it is drawn; return '' or why that is not asked."""
@@ -201,8 +199,9 @@ class SafetyMachine:
         watch.read(now, joints, self.held_back, self._sent.powered, self._dt)
         if self._left:
             self._share_supply(self._left)
+        missing = self._look(efforts) if self._is_standing else NO_REASON
         if self.state is State.CHECKING:
-            self._check(efforts)
+            self._check(missing, efforts.effort)
         elif self.state in CARRYING:
             self._latch(self._carried_fault(efforts), self._now)
         self._latch(watch.judge_pause(now, self._sent.effort, self.state in CARRIED), now)
@@ -261,28 +260,34 @@ class SafetyMachine:
         bounded = self.shaper.damping(self._dt, watch.samples, watch.silent, torque, tuple(damping), watch.is_late)
         return Command(torque, bounded, tuple(send), any(motor.may_be_on for motor in watch.joints))
 
-    def _check(self, efforts: Efforts) -> None:
-        """Continue to PROVING once all has been well for a while, or trip on a fault that refuses the start.
+    def _look(self, efforts: Efforts) -> Fault | Reason:
+        """Return what an arm that is off lacks for a start, and note since when it has been calm, enabled or not.
 
         Efforts may be late as they may while the arm is carried, but not in the cycle in which the checks end.
         """
-        watch, limits, effort, stale = self.watch, self.limits, efforts.effort, self.stale
-        are_late = stale.step(self._now, self._dt, self._now - efforts.answered, efforts.held)
-        missing = missing_for_a_start(limits, watch.samples, watch.fault, watch.trusted)
+        watch, age = self.watch, self._now - efforts.answered
+        are_late = self.stale.step(self._now, self._dt, age, efforts.held)
+        missing = missing_for_a_start(self.limits, watch.samples, watch.fault, watch.trusted) or missing_of_trunk(
+            self.limits, self.motion.trunk_tilt
+        )
+        if not missing and not self._all_off:
+            missing = Reason(Wait.MOTORS_OFF, "the motors to confirm that they are off")
+        if missing or are_late or self._calm_since > self._now:
+            self._calm_since = self._now
+        if not missing and (efforts.effort is None or are_late):
+            missing = Reason(Wait.EFFORTS, "effort commands")
+            # While an IMU settles, the compensator answers in time without efforts.
+            self._calm_since = max(self._calm_since, self._now + START_GATE.efforts - START_GATE.calm)
+        return missing
+
+    def _check(self, missing: Fault | Reason, effort: Sequence[float] | None) -> None:
+        """Continue to PROVING once all has been well for a while, or trip on a fault that refuses the start."""
+        watch, limits = self.watch, self.limits
         if isinstance(missing, Fault):
             if not any(motor.is_clearing for motor in watch.joints):
                 self._latch(missing, self._now)
                 return
             missing = Reason(missing.code, missing.reason)
-        missing = missing or missing_of_trunk(limits, self.motion.trunk_tilt)
-        if not missing and not self._all_off:
-            missing = Reason(Wait.MOTORS_OFF, "the motors to confirm that they are off")
-        if missing or are_late:
-            self._calm_since = self._now
-        if not missing and (effort is None or are_late):
-            missing = Reason(Wait.EFFORTS, "effort commands")
-            # While an IMU settles, the compensator answers in time without efforts.
-            self._calm_since = max(self._calm_since, self._now + START_GATE.efforts - START_GATE.calm)
         asks = not watch.trusted and limits.start_pose == CONFIRM
         patience = limits.enable_timeout + (HANGING_ARM.patience if asks else 0.0)
         if watch.fault:
@@ -292,14 +297,14 @@ class SafetyMachine:
         # It passes, too, while the bridge cannot switch motors on, and while the operator looks at the arm.
         self.waiting_for = self.setup_error or missing or Reason(Wait.CALM, f"{START_GATE.calm:g} s without a fault")
         is_calm = not (self.setup_error or missing) and self._now - self._calm_since >= START_GATE.calm
-        if is_calm and effort is not None and not stale.are_used:
+        if is_calm and effort is not None and not self.stale.are_used:
             fault = None if watch.trusted else torque_while_hanging(limits, effort)
             if fault:
                 self._latch(fault, self._now)
                 return
             self.waiting_for = NO_REASON
             largest = 0.0 if watch.trusted else limits.sign_check_torque
-            self._switching, self._attempts = SwitchingOn(self.watch.replies), 0
+            self._switching, self._attempts, self._calm_since = SwitchingOn(self.watch.replies), 0, math.inf
             self._switch_on = SwitchOnCheck(limits)
             self.signs = SignCheck(limits.joint_names, [min(largest, most) for most in limits.max_effort])
             watch.reset_delivery()
@@ -356,8 +361,9 @@ class SafetyMachine:
                 self._on(StateEvent.RAMPED)
         is_guided = damped or self.state is State.RAMPING_IN
         share = [1.0 - left for left in self._rise.shares]
-        late = DAMPING if self.stale.are_used else 0.0
-        torque, damping = self.shaper.shape(self._dt, joints, effort, share, self._sent.effort, is_guided, late)
+        torque, damping = self.shaper.shape(
+            self._dt, joints, effort, share, self._sent.effort, is_guided, DAMPING if self.stale.are_used else 0.0
+        )
         command = self._powered(torque, damping, self._commands)
         for joint in self.shaper.joints:
             self.acted.update(dict.fromkeys(joint.limiting, self._now))
