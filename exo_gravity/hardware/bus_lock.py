@@ -52,7 +52,7 @@ class CommandNotes(ctypes.Structure):
 
     _fields_ = (
         ("time", ctypes.c_double),  #: s, of the last note
-        ("_powered", ctypes.c_double),
+        ("_powered", ctypes.c_double),  #: 2 while signs are not proven
         ("_count", ctypes.c_double),
         ("_values", ctypes.c_double * (2 * MAX_JOINTS)),
         ("heartbeat", ctypes.c_double),  #: s, at which the watchdog last ran; 0 before it runs
@@ -63,7 +63,7 @@ class CommandNotes(ctypes.Structure):
     def note(self, command: Command) -> None:
         """Note what the motors are about to receive, and whether one may be on."""
         count, values = len(command.effort), (*command.effort, *command.damping)
-        NOTES[count].pack_into(self, 0, self.clock.monotonic(), command.powered, count, *values)
+        NOTES[count].pack_into(self, 0, self.clock.monotonic(), command.powered + command.is_unproven, count, *values)
 
     @property
     def command(self) -> Command:
@@ -71,8 +71,13 @@ class CommandNotes(ctypes.Structure):
         powered = bool(self._powered)
         count = int(self._count) if self._count in range(MAX_JOINTS + 1) else 0
         values = self._values[: 2 * count]
-        send = Send.COMMAND if powered else Send.POLL
-        return Command(tuple(values[:count]), tuple(values[count:]), (send,) * count, powered)
+        return Command(
+            tuple(values[:count]),
+            tuple(values[count:]),
+            (Send.COMMAND if powered else Send.POLL,) * count,
+            powered,
+            self._powered == 2.0,
+        )
 
     @property
     def is_damaged(self) -> bool:
@@ -168,7 +173,13 @@ class ArmNotes:
             for i, command in enumerate(commands)
         ]
         effort, damping = zip(*columns, strict=True)
-        return Command(effort, damping, (Send.COMMAND,) * count, any(command.powered for command in commands))
+        return Command(
+            effort,
+            damping,
+            (Send.COMMAND,) * count,
+            powered=any(command.powered for command in commands),
+            is_unproven=any(command.is_unproven for command in commands),
+        )
 
     @property
     def time(self) -> float:

@@ -287,7 +287,7 @@ def lower(bus: MotorBus, command: Command, period: float) -> None:
         silent = [now - joint.time > LOWERING.reply_timeout for joint in joints]
         rest.step(now, joints, silent)
         left = max(0.0, 1.0 - (now - start) / LOWERING.fade)
-        is_down = exits or (not left and not any(silent) and now - rest.since >= LOWERING.rest)
+        is_down = exits or command.is_unproven or (not left and not any(silent) and now - rest.since >= LOWERING.rest)
         if is_down:
             exits += 1
             send = (Send.EXIT,) * len(joints)

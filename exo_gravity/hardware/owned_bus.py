@@ -81,7 +81,7 @@ def let_down(arm: ArmOnBus, notes: ArmNotes, log: Callable[[str], None], is_want
         if excess_torque(joint.effort, expected) > 0.0:  # not without a reply: that is NaN
             effort[i], damping[i] = joint.effort, 0.0
     loop = ControlLoop(motors, arm.limits, arm.period, NoController())
-    loop.safety.take_over(effort, damping, clock.monotonic())
+    loop.safety.take_over(effort, damping, clock.monotonic(), command.is_unproven)
     was_unreached = False
     while not loop.is_off and loop.cycle():
         if loop.safety.is_unreached and not was_unreached:

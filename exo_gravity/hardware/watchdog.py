@@ -2,10 +2,10 @@
 """The watchdog: a process that lets the arm down when its bridge dies, freezes or hands it over.
 
 It shares the notes of each bus with the bridge, and a pipe, which breaks when the bridge dies for any reason. It
-inherits the lock of each bus. If the motors were on, it continues from the last noted command. A bridge that is alive
-but has noted nothing for `frozen_timeout` is killed first: two processes must never command one motor. Once a motor has
-not replied for seconds and all others are down, the next bridge may ask for the bus: then the watchdog ends, and its
-notes stay.
+inherits the lock of each bus. If the motors were on, it continues from the last noted command; motors whose signs were
+not proven yet are switched off, because damping could drive them. A bridge that is alive but has noted nothing for
+`frozen_timeout` is killed first: two processes must never command one motor. Once a motor has not replied for seconds
+and all others are down, the next bridge may ask for the bus: then the watchdog ends, and its notes stay.
 
 While the motors are on it keeps the computer from being suspended: that would freeze both processes.
 

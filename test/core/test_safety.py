@@ -314,6 +314,16 @@ ROWS: dict[str, Sequence[Step]] = {
             (0.08, 0.0, True), (0.08, TURN, False), (0.2, 0.0, True), (0.2, -TURN, False), (0.4, 0.0, False),
         )
     },
+    "who takes over while signs are not proven takes the push back without damping": [
+        lambda arm: arm.machine.probe(arm.now), wait(), let(applied=[0.0, 1.0, 0.0, 0.0]),
+        lambda arm: arm.machine.take_over(arm.applied, (0.0,) * 4, arm.now, True), wait(),
+        has(lambda arm: arm.command.effort[1] == pytest.approx(1.0 - MAX_EFFORT_RATE * PERIOD)),
+        has(lambda arm: arm.command.damping == OFF.damping), wait(0.2), ALL_OFF, see(State.DISABLED, ""),
+    ],
+    "the notes say that signs are not proven until they are": [
+        enable, until(State.PROVING), has(lambda arm: arm.command.is_unproven),
+        until(State.RAMPING_IN), has(lambda arm: not arm.command.is_unproven),
+    ],
     "a loop that stood still for long leaves zeros in doubt": [
         *let_down_by(FaultCode.COMMAND_STALE), stall(0.9), wait(), has(lambda arm: arm.machine.why_not_resumed == ""),
         stall(1.1), wait(), see(words="zeros"),
@@ -577,14 +587,13 @@ class YieldingArm(SafetyRun):
 
 def test_each_joints_sign_is_checked_once_and_gently_before_the_arm_is_carried():
     arm = YieldingArm((0.5, 0.2, 0.5, 0.5))
-    for step in (enable, wait(1.5), see(State.PROVING), until(State.ACTIVE, 16.0), SMOOTH):
+    for step in (
+        enable, wait(1.5), see(State.PROVING), until(State.ACTIVE, 16.0), SMOOTH,
+        has(lambda arm: all(-0.05 < position < 0.06 for position in arm.position)),
+        *DISABLED_AGAIN, let(largest_effort=[0.0] * 4), enable, until(State.ACTIVE),
+        has(lambda arm: arm.largest_effort == [SWITCH_ON.torque] * 4),  # the check that the motors are on
+    ):  # fmt: skip
         step(arm)
-    assert all(-0.05 < position < 0.06 for position in arm.position)
-    for step in DISABLED_AGAIN:
-        step(arm)
-    arm.largest_effort = [0.0] * 4
-    arm.until_active()
-    assert arm.largest_effort == [SWITCH_ON.torque] * 4  # the check that the motors are on
 
 
 SLOWER, FASTER = (0.5, 0.2, 0.2, 0.5), (0.5, 0.2, 0.5, 0.2)  # the third joint than the fourth, which it carries
@@ -682,11 +691,5 @@ def test_one_name_holds_control_for_as_long_as_it_is_renewed(requests):
 
 def test_a_rate_is_averaged_over_a_second_or_more_and_restarts_with_its_counter():
     rate = Rate()
-    assert [rate.update(now, count) for now, count in ((10.0, 0), (10.5, 250), (11.0, 500), (11.1, 540))] == [
-        0.0,
-        0.0,
-        500.0,
-        500.0,
-    ]
-    assert rate.update(12.0, 3) == 0.0
-    assert rate.update(14.0, 203) == 100.0
+    counts = (10.0, 0), (10.5, 250), (11.0, 500), (11.1, 540), (12.0, 3), (14.0, 203)
+    assert [rate.update(now, count) for now, count in counts] == [0.0, 0.0, 500.0, 500.0, 0.0, 100.0]

@@ -58,7 +58,7 @@ from .arms import raised_arm as raised
 
 CHANNEL = f"can{os.getpid()}"  # other test runs share the network namespace
 CAN0 = ("socketcan", CHANNEL, {})
-NOTED = command_of((0.0, 3.0, 1.0, 0.5), (0.0, 5.0, 0.0, 0.0))
+NOTED = command_of((0.0, 3.0, 1.0, 0.5), (0.0, 5.0, 0.0, 0.0))._replace(is_unproven=True)
 ENDED = "the last can_bridge on this bus and its watchdog ended with the motors on: letting the arm down"
 OWNER = f"/right/can_bridge (PID {os.getpid()})"
 # Prints why a process of another session, with other folders, may not have the bus.
@@ -345,6 +345,15 @@ def test_a_motor_that_has_lost_its_power_is_not_pushed_by_the_noted_torque():
     arm.notes.note(command_of((0.0, 6.0, 2.0, 1.0)))
     assert lowered(arm)
     assert arm.fastest < 0.01 and not arm.device.powered
+
+
+def test_motors_whose_signs_were_not_proven_are_switched_off_without_damping_which_drives_a_reversed_one():
+    arm = CarriedArm(has_wearer=False, mode="one_g")
+    ACTS["torque_reversed"](arm, 1)
+    arm.between_cycles(arm.safety.enable)
+    assert arm.run_until(lambda: abs(arm.device.arm.velocities[1]) > 0.05)
+    assert lowered(arm.leave())
+    arm.assert_not_thrown()
 
 
 def reach_again(arm: CarriedArm) -> None:

@@ -103,6 +103,7 @@ class Command(NamedTuple):
     damping: tuple[float, ...]  #: (n,) Nm s/rad
     send: tuple[Send, ...]  #: (n,)
     powered: bool  #: whether one of them may be on
+    is_unproven: bool = False  #: whether they are being switched on, and damping may yet drive a joint
 
     @classmethod
     def off(cls, count: int) -> "Command":

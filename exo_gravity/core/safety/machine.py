@@ -175,11 +175,16 @@ class SafetyMachine:
         """
         self._latch(Fault(code, reason), now)
 
-    def take_over(self, effort: Sequence[float], damping: Sequence[float], now: float) -> None:
-        """Let down an arm whose controller has died while its motors applied `effort` (n,) Nm and `damping` (n,)."""
+    def take_over(
+        self, effort: Sequence[float], damping: Sequence[float], now: float, is_unproven: bool = False
+    ) -> None:
+        """Let down an arm whose controller has died while its motors applied `effort` (n,) Nm and `damping` (n,).
+
+        is_unproven: whether signs were not proven: then the push is taken back, and the motors are switched off.
+        """
         self._sent, self._left = Command(tuple(effort), tuple(damping), self._commands, True), effort
-        self.watch.change_power(PowerChange.TAKEN_OVER)
-        self.state = State.ACTIVE
+        self.watch.change_power(PowerChange.SWITCH_ON if is_unproven else PowerChange.TAKEN_OVER)
+        self.state = State.PROVING if is_unproven else State.ACTIVE
         self._on(StateEvent.DISABLE, now)
 
     def probe(self, now: float) -> None:
@@ -258,7 +263,13 @@ class SafetyMachine:
         """Return a command of motors that may be on, within the barrier."""
         watch, torque = self.watch, tuple(effort)
         bounded = self.shaper.damping(self._dt, watch.samples, watch.silent, torque, tuple(damping), watch.is_late)
-        return Command(torque, bounded, tuple(send), any(motor.may_be_on for motor in watch.joints))
+        return Command(
+            torque,
+            bounded,
+            tuple(send),
+            powered=any(motor.may_be_on for motor in watch.joints),
+            is_unproven=not watch.trusted and any(motor.power is Power.ENTERING for motor in watch.joints),
+        )
 
     def _look(self, efforts: Efforts) -> Fault | Reason:
         """Return what an arm that is off lacks for a start, and note since when it has been calm, enabled or not.

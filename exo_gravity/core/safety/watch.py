@@ -153,6 +153,7 @@ class PowerChange(str, Enum):
 
 NEXT: dict[tuple[Power, PowerChange], Power] = {
     (Power.OFF, PowerChange.SWITCH_ON): Power.ENTERING,
+    (Power.UNKNOWN, PowerChange.SWITCH_ON): Power.ENTERING,  # that another process was switching on
     (Power.ENTERING, PowerChange.SHOWN_ON): Power.ON,
     (Power.ON, PowerChange.SILENT): Power.SILENT,
     (Power.SILENT, PowerChange.REPLIES): Power.ON,
