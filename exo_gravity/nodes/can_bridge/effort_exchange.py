@@ -35,14 +35,19 @@ class EffortExchange:
     """The topics `joint_states` and `effort_commands` of `node`, the controller of the loop.
 
     get_loop returns the present control loop, None while the node is inactive. refusal: why the last message that was
-    refused was. answer: of a compensator in this process.
+    refused was. answer: of a compensator in this process. poll: called at the end of each cycle with replies.
     """
 
     def __init__(
-        self, node: Node, limits: Limits, get_loop: Callable[[], ControlLoop | None], answer: Answer | None = None
+        self,
+        node: Node,
+        limits: Limits,
+        get_loop: Callable[[], ControlLoop | None],
+        answer: Answer | None = None,
+        poll: Callable[[], object] = lambda: None,
     ) -> None:
         self.refusal = NO_REASON
-        self._answer = answer
+        self._answer, self._poll = answer, poll
         self._limits = limits
         self._get_loop = get_loop
         self._clock = node.get_clock()
@@ -82,6 +87,7 @@ class EffortExchange:
         self._publisher.publish(message)
         if self._answer and (loop := self._get_loop()) and (efforts := self._answer(message)):
             self._receive(loop, efforts)
+        self._poll()
 
     def _on_efforts(self, message: JointState | bytes, info: dict[str, Any]) -> None:
         loop = self._get_loop()

@@ -14,7 +14,7 @@ import sys
 import threading
 import time
 from collections.abc import Callable
-from functools import partial, wraps
+from functools import wraps
 from typing import Any
 
 import rclpy
@@ -59,8 +59,8 @@ RECOVER = "EXO_GRAVITY_RECOVER"
 WITHOUT_LOG_FILE = ("--ros-args", "--disable-external-lib-logs")
 
 
-def _follow_gravity(node: Node, get_loop: Callable[[], ControlLoop | None], is_monitored: bool) -> None:
-    """Tell the loop where gravity points, as the trunk's tilt arrives; before that it is upright.
+def _gravity_for(node: Node, get_loop: Callable[[], ControlLoop | None], is_monitored: bool) -> TiltSubscription:
+    """Return what tells the loop where gravity points, as often as it is polled; before that it is upright.
 
     The side is that of the node's namespace: a compensator with the wrong `side` does not decide it. Without one, only
     how far the trunk is from upright counts.
@@ -68,16 +68,15 @@ def _follow_gravity(node: Node, get_loop: Callable[[], ControlLoop | None], is_m
     side = node.get_namespace().rpartition("/")[2]
     if side not in SIDES:
         if is_monitored:
-            expected = f"0, or the node in a namespace that ends with {' or '.join(SIDES)}"
-            raise ParameterError("largest_moment", "given", expected)
+            raise ParameterError("largest_moment", "given", f"0, or the namespace one of {' or '.join(SIDES)}")
         side = SIDES[0]
     tilt = TiltInput(side, TILT_TIMEOUT)
 
     def pass_on(now: float) -> None:
         if loop := get_loop():
-            loop.call(partial(loop.safety.motion.follow, now, tilt.at(now), tilt.overtaken))
+            loop.safety.motion.follow(now, tilt.at(now), tilt.overtaken)
 
-    TiltSubscription(node, tilt, threading.Lock(), on_tilt=pass_on)
+    return TiltSubscription(node, tilt, threading.Lock(), on_tilt=pass_on, is_polled=True)
 
 
 def _transition(function: Callable[[Any], None]) -> Callable[..., TransitionCallbackReturn]:
@@ -117,14 +116,14 @@ class CanBridge(LifecycleNode):
         self._bus: MotorBus | None = None  # while inactive
         self._is_leaving = False  # the arm is let down for a transition
         self.error = ""  #: why the last transition failed
-        self._exchange = EffortExchange(self, limits, lambda: self.loop, answer)
+        gravity = _gravity_for(self, lambda: self.loop, any(limits.largest_moment))
+        self._exchange = EffortExchange(self, limits, lambda: self.loop, answer, gravity.poll)
         lease = operation.Operator(self, lambda: self.loop).lease
         services = operation.BridgeServices(
             self, lambda: self.loop, motors, lambda: LEAVING if self._is_leaving else ""
         )
         self._report = operation.BridgeReport(self, self._arm, traffic, lease, services)
         prepare_transitions(self, self._prepare)
-        _follow_gravity(self, lambda: self.loop, any(limits.largest_moment))
         self.create_timer(REPORT_PERIOD, self._on_report)
         operation.log_risks(self, self._arm.address[0], traffic, values["rate"])
         if values["autostart"]:
