@@ -437,10 +437,10 @@ class SupportAdaptation:
         support' = - rise * speed / full - (support - set support) / memory
 
     within the set support and 1; the first term stays within -lift * rise and rise. So lifting takes back part of what
-    sinking gave: at a support of at most 1, only a person can lift the arm. A motion faster than `reach` is a movement,
-    not sinking. Sinking counts only while the wearer's share lies between 0 and what is left to them. That excludes a
-    hand that presses the arm down, and motors that are off. While the share is unknown, the support falls to the set
-    one, by `rise` per second.
+    sinking gave: at a support of at most 1, only a person can lift the arm. If the set support is lowered, so is this.
+    A motion faster than `reach` is a movement, not sinking. Sinking counts only while the wearer's share lies between 0
+    and what is left to them. That excludes a hand that presses the arm down, and motors that are off. While the share
+    is unknown, the support falls to the set one, by `rise` per second.
 
     Assistance as needed with forgetting: Wolbrecht, Chan, Reinkensmeyer and Bobrow, IEEE TNSRE 2008.
 
@@ -458,6 +458,7 @@ class SupportAdaptation:
         self._time = self._due = -math.inf  # s
         self._theta: Sequence[float] | None = None
         self._speed = 0.0  # rad/s, upwards
+        self._set = 0.0  # 0..1, the set support of the last update
 
     def update(
         self,
@@ -481,7 +482,9 @@ class SupportAdaptation:
             self._theta, self._speed = None, 0.0
         if not settings.is_adaptive or dt > REQUEST.expires:
             self.requested = None
-        in_force = max(settings.support, self.requested or 0.0)
+        self._set, lowered = settings.support, min(0.0, settings.support - self._set)
+        self.support += lowered
+        in_force = max(settings.support, (self.requested or 0.0) + lowered)
         if not settings.is_adaptive or not is_running:
             self._theta, self._speed = None, 0.0
             self.support, self.problem = in_force, ""
@@ -506,8 +509,7 @@ class SupportAdaptation:
         theta, velocity = joints
         moved = map(operator.sub, theta, self._theta or theta)
         self._theta, part = theta, dt / (ADAPTATION.mean + dt)
-        size = math.hypot(*weight)
-        rise = sum(map(operator.mul, weight, moved)) / max(size, SHARE.least_weight)
+        rise = sum(map(operator.mul, weight, moved)) / max(math.hypot(*weight), SHARE.least_weight)
         is_moved = max(map(abs, velocity)) > ADAPTATION.reach
         self._speed = 0.0 if is_moved else self._speed + part * (rise / dt - self._speed)
         self.problem = ""
@@ -602,9 +604,8 @@ class WearerWatch:
     def values(self, now: float) -> dict[str, str]:
         """Return torques and share with their 95 % bands, the newest contact, and the support, for /diagnostics."""
         estimate = self._estimate if now - self._time <= OLD else None
-        values = values_of(self._names, estimate, self.adaptation.shares if estimate else None)
         requested, problem, contact = self.adaptation.requested, self.adaptation.problem, self._contact
-        values |= {
+        values = values_of(self._names, estimate, self.adaptation.shares if estimate else None) | {
             "support adapts": (Adapts.HELD if problem else Adapts.ON) if self._settings.is_adaptive else Adapts.OFF,
             "support adapts text": problem,
             "support asked for": NONE if requested is None else f"{requested:.3f}",
@@ -613,8 +614,11 @@ class WearerWatch:
         if contact.last is None:
             return values | dict.fromkeys(("contact joint", "contact torque (Nm)", "contact age (s)"), NONE)
         at, joint, jump = contact.last
-        values["contact joint"], values["contact torque (Nm)"] = self._names[joint], f"{jump:.1f}"
-        return values | {"contact age (s)": f"{now - at:.0f}"}
+        return values | {
+            "contact joint": self._names[joint],
+            "contact torque (Nm)": f"{jump:.1f}",
+            "contact age (s)": f"{now - at:.0f}",
+        }
 
 
 def values_of(names: Sequence[str], estimate: WearerEstimate | None, shares: Shares | None) -> dict[str, str]:

@@ -319,5 +319,4 @@ def touched(torques: list[float], deviation: float = 0.2, gap: float = 0.0) -> C
 )
 def test_only_a_blow_is_a_contact_with_its_time_joint_and_sign(torques, deviation, gap, count) -> None:
     assert touched(torques, deviation, gap).count == count
-    blow = touched([*REST, *[-4.0] * 100]).last
-    assert blow == (pytest.approx(0.5, abs=0.02), 3, pytest.approx(-3.6, abs=0.4))
+    assert touched([*REST, *[-4.0] * 100]).last == (pytest.approx(0.5, abs=0.02), 3, pytest.approx(-3.6, abs=0.4))
