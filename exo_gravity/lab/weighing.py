@@ -11,7 +11,7 @@ load: what the wearer carries is missing from the result, unless their torque is
 
 import math
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
@@ -82,7 +82,8 @@ def refusal(s: Settings, terms: Sequence[str], rate: float) -> Reason:
 class Weighing:
     """One weighing, from the first call of `torque` on.
 
-    names: of the joints (n,). rate: of the calls, Hz. empty: result of the empty hand, if known.
+    settings: of the compensator. names: of the joints (n,). rate: of the calls, Hz. empty: result of the empty hand, if
+    known for these settings, whatever their payload.
     result: None while there is none. trouble: why there is none. elapsed: s since it began.
     """
 
@@ -90,7 +91,7 @@ class Weighing:
         self.result: Weighed | None = None
         self.trouble = NO_REASON
         self.elapsed = 0.0
-        self._settings, self._names, self._empty = settings, names, empty
+        self.settings, self._names, self._empty = settings, names, empty
         self._tracker, friction = Tracker(rate, settings.max_effort), settings.terms.friction
         if any(friction.coulomb):  # less what the term `friction` compensates
             self._tracker.friction = (1.0 - friction.share) * np.array(friction.coulomb)
@@ -107,7 +108,7 @@ class Weighing:
     def empty(self) -> Weighed | None:
         """The latest result for an empty hand, or None."""
         result = self.result
-        is_empty = result and abs(result.mass) < WEIGHING.empty and not self._settings.payload.mass
+        is_empty = result and abs(result.mass) < WEIGHING.empty and not self.settings.payload.mass
         return result if is_empty else self._empty
 
     @property
@@ -133,7 +134,7 @@ class Weighing:
         if self.result is None or self.excess is None or self.empty is self.result:
             return None
         more, band = self._beyond_empty or self.excess
-        return max(0.0, self._settings.payload.mass + more), band
+        return max(0.0, self.settings.payload.mass + more), band
 
     @property
     def _beyond_empty(self) -> tuple[float, float] | None:
@@ -167,7 +168,7 @@ class Weighing:
         The compensator bounds the difference.
         """
         if self._matrix is None:
-            self._matrix, dt = self._settings.moving.links.matrix(theta), 0.0
+            self._matrix, dt = self.settings.moving.links.matrix(theta), 0.0
             self._begin(theta, velocity, tilt)
         if self.is_over:
             return torque
@@ -186,7 +187,7 @@ class Weighing:
         tilt; and the standard errors of the result: of the torque's scale, as a share, and in kg of the trunk's tilt,
         and of the whole model with it.
         """
-        s, error, gravity = self._settings, self._settings.model_error, self._settings.arm.gravity
+        s, error, gravity = self.settings, self.settings.model_error, self.settings.arm.gravity
         self._lever = np.array(s.unit_load.torque(theta, tilt))  # dz/dq, m
         fastest = max(map(abs, velocity))
         if np.linalg.norm(self._lever) < WEIGHING.least_lever:
@@ -225,11 +226,11 @@ class Weighing:
 
     def _is_wrong(self, dt: float) -> bool:
         """Note what is wrong with the motion; return whether anything is."""
-        error, gravity = self._tracker.error, self._settings.arm.gravity
+        error, gravity = self._tracker.error, self.settings.arm.gravity
         worst = int(np.argmax(np.abs(error)))
         times = zip(self._names, self._tracker.saturated, strict=True)
         saturated = [name for name, time in times if time > WEIGHING.persistence]
-        correction = self._tracker.correction / (self._settings.arm.gain * gravity)
+        correction = self._tracker.correction / (self.settings.arm.gain * gravity)
         mass = float(self._weight @ correction)
         foreign = (np.abs(correction - mass * self._lever) * gravity).tolist()
         is_foreign = max(foreign) > WEIGHING.foreign or not -WEIGHING.lifted < mass < MAX_PAYLOAD
@@ -255,8 +256,8 @@ class Weighing:
     def _finish(self, sweeps: Sequence[Sweep], shares: np.ndarray) -> None:
         """Fit the mass to the sweeps, of whose way each joint must have followed MOTION.followed; shares: (n,)."""
         seen, unrest = average(sweeps)
-        error, weight, gravity = self._settings.model_error, self._weight, self._settings.arm.gravity
-        scale = self._settings.arm.gain * gravity
+        error, weight, gravity = self.settings.model_error, self._weight, self.settings.arm.gravity
+        scale = self.settings.arm.gain * gravity
         mass = float(weight @ (seen.effort / scale))
         needed = mass * scale * self._lever
         parts = (error.torque, seen.spread, self._share * needed, error.wearer * self._worn, self._tilted)
@@ -301,7 +302,14 @@ class Weigher:
         self._refusal = refusal(control.settings, control.terms.active, rate)
         if not self._refusal and last and not last.is_over:
             self._refusal = Reason(WeighingRefused.UNDER_WAY, "a weighing is under way")
-        weighing = Weighing(control.settings, self._names, rate, last.empty if last else None)
+        weighing = Weighing(
+            control.settings,
+            self._names,
+            rate,
+            last.empty
+            if last and replace(last.settings, payload=control.settings.payload) == control.settings
+            else None,
+        )
         if not self._refusal and not control.lend(weighing):
             self._refusal = Reason(WeighingRefused.CHANGING_LOAD, "the load is changing: wait for it")
         if not self._refusal:

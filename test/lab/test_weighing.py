@@ -148,3 +148,7 @@ def test_with_the_empty_hand_weighed_before_the_error_of_the_model_is_left_out()
     assert second.text.endswith(": payload.mass = 0.990 carries it")
     assert second.empty is first.result  # 1.05 kg is no empty hand
     assert "empty" not in weighed(1.05, ELSEWHERE, first.empty).text
+    for change, is_known in (({"payload": SETTINGS.payload._replace(mass=0.5)}, True), ({"wearer_mass": STILL}, False)):
+        weigher = Weigher(Mock(settings=replace(SETTINGS, **change), **{"terms.active": ()}), PARTS)
+        weigher.weighing = first
+        assert weigher.begin(RATE) == "" and (weigher.weighing.empty is first.result) == is_known
