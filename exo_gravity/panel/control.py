@@ -2,10 +2,10 @@
 """Who operates the arms, and what a page may ask for.
 
 A page is one browser tab. It keeps its secret while it is reloaded, and confirms each few states that it receives. A
-page that confirms nothing for 2 s is gone: the laptop is closed, or the network lost. One page at a time holds control,
-the others watch. Every page may let the arms down at any time. Each confirmation of the page
-that holds control renews its lease at the arms (core/safety/lease.py), if the panel has one: no page, no panel, no
-lease. A request is an object such as {"do": "set", "arm": "right", "values": {"support": 0.3}}.
+page that confirms nothing for 2 s is gone: the laptop is closed, or the network lost. It starts no arm: its request may
+be as late. One page at a time holds control, the others watch. Every page may let the arms down at any time. Each
+confirmation of the page that holds control renews its lease at the arms (core/safety/lease.py), if the panel has one:
+no page, no panel, no lease. A request is an object such as {"do": "set", "arm": "right", "values": {"support": 0.3}}.
 """
 
 import asyncio
@@ -196,8 +196,9 @@ def without_value(error: ParameterError) -> str:
 
 def sentence(request: Mapping[str, Any]) -> str:
     """Describe a request for the log, without the wearer's data."""
-    values = request.get("values", {}).items()
-    shown = ", ".join(key if key.startswith("wearer.") else f"{key} = {value}" for key, value in values)
+    shown = ", ".join(
+        key if key.startswith("wearer.") else f"{key} = {value}" for key, value in request.get("values", {}).items()
+    )
     words = (request["do"].replace("_", " "), request.get("arm"), shown, request.get("name"))
     return " ".join(filter(None, words))
 
@@ -268,8 +269,7 @@ class Control:
     @property
     def other_operator(self) -> str:
         """The name of another operator who holds control of an arm, instead of this panel's page; '' for none."""
-        others = [self.arms.other_holder(arm, str(self.holder)) for arm in self.arms.names]
-        return next(filter(None, others), "")
+        return next(filter(None, (self.arms.other_holder(arm, str(self.holder)) for arm in self.arms.names)), "")
 
     async def perform(self, body: Any, secret: str, address: str, is_here: bool = False) -> tuple[int, str]:
         """Do what the JSON value `body` asks for, sent by the page with `secret`, at `address`.
@@ -292,7 +292,9 @@ class Control:
                 return self._answer(page, text, f"{other} holds control of this arm", 403)
             if kind == "open" and not is_here:
                 return self._answer(page, text, "only a browser on the panel's computer opens programs there", 403)
-        if kind in ("enable", "activate", "resume"):  # by a page that confirms nothing, the arm is not carried for long
+        if kind in ("enable", "activate", "resume", "confirm_pose"):
+            if self.is_gone():  # the network may have kept the request back: nobody expects it any more
+                return self._answer(page, text, "this page has confirmed nothing for 2 s: look at the arm first", 403)
             self.arms.lease(str(page), "hold")
         try:
             problem = await self._carry_out(request, kind, arm, page)

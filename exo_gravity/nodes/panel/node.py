@@ -81,7 +81,10 @@ ASKED = {  # service and request for each request of a page; None for the parame
 
 
 class ArmClient:
-    """The services of one arm, in the namespace `/name`, its joint states, and who controls it."""
+    """The services of one arm, in the namespace `/name`, its joint states, and who controls it.
+
+    is_wanted: whether the arm was not asked to be let down since it was to be activated.
+    """
 
     def __init__(self, node: Node, name: str) -> None:
         self.services = {
@@ -92,15 +95,19 @@ class ArmClient:
         self._transitions = node.create_client(ChangeState, f"/{name}/{BRIDGE}/change_state")
         self.control = node.create_publisher(KeyValue, f"/{name}/{BRIDGE}/control", 10)
         self.joints = Latest(node, JointState, f"/{name}/joint_states", joint_rows)
+        self.is_wanted = False
 
     async def activate(self) -> str:
-        """Configure the bridge, unless it is, and activate it, which enables the arm; return '' or why not."""
-        try:
-            for step in (Transition.TRANSITION_CONFIGURE, Transition.TRANSITION_ACTIVATE):
-                request = ChangeState.Request(transition=Transition(id=step))
-                answer = await answer_of(self._transitions, request, TIMING.transition_timeout)
-        except ExoGravityError as error:
-            return str(error)
+        """Configure the bridge, unless it is, and activate it, which enables the arm; return '' or why not.
+
+        Raises ExoGravityError if it does not answer.
+        """
+        self.is_wanted = True
+        for step in (Transition.TRANSITION_CONFIGURE, Transition.TRANSITION_ACTIVATE):
+            if not self.is_wanted:
+                return "the arm was asked to be let down"
+            request = ChangeState.Request(transition=Transition(id=step))
+            answer = await answer_of(self._transitions, request, TIMING.transition_timeout)
         return "" if answer.success else "the bridge could not be activated: it is active, or its log says why"
 
 
@@ -150,8 +157,10 @@ class Arms:
 
     def nodes(self) -> dict[str, tuple[Values, Values]]:
         """Return the newest parameters of bridge and compensator by arm, {} while they are not known."""
-        values = self._others.values
-        return {arm: (values(f"/{arm}/{BRIDGE}"), values(f"/{arm}/{COMPENSATOR}")) for arm in self.names}
+        return {
+            arm: (self._others.values(f"/{arm}/{BRIDGE}"), self._others.values(f"/{arm}/{COMPENSATOR}"))
+            for arm in self.names
+        }
 
     # For a trial (`Device` of exo_gravity.panel.recordings); called on the web server's thread
 
@@ -201,6 +210,7 @@ class Arms:
             if f"/{arm}/{SIMULATOR}" not in self._others.found:
                 return "the arm is not simulated"
             kind, values = "perform", {"trial": str(packaged("home.yaml"))}
+        self.clients[arm].is_wanted &= kind != "let_down"
         given = [Parameter(name, value=value).to_parameter_msg() for name, value in values.items()]
         request = ASKED[kind][-1] or SetParametersAtomically.Request(parameters=given)
         return await call(self.clients[arm].services[kind], request)
@@ -272,8 +282,10 @@ class Panel(Node):
         if scripts is None or not scripts.is_dir():
             raise ParameterError("trials", values["trials"], "a folder")
         self._recordings = Recordings(values["output"], scripts, self._arms, self._note, time.monotonic)
-        own = {name: values[name] for name in ("language", "dead_man", "markers")}
-        self._own_setup = {**own, "trials": list(self._recordings.trials)}
+        self._own_setup = {
+            "trials": list(self._recordings.trials),
+            **{name: values[name] for name in ("language", "dead_man", "markers")},
+        }
         self._shown: Any = None  # the nodes' parameters that the pages have
         self._changes = LoadChanges()
         control = Control(self._arms, self._recordings, self._note, time.monotonic)
@@ -311,8 +323,11 @@ class Panel(Node):
         if nodes != self._shown:
             self._shown = nodes
             self._server.setup = {**self._own_setup, **setup_of(nodes)}
-        arms = self._changes.with_causes(self._arms.state(), nodes, time.monotonic())
-        self._server.state = {"arms": arms, "tilt": self._tilt.within(TIMING.silent), **self._recordings.state()}
+        self._server.state = {
+            "arms": self._changes.with_causes(self._arms.state(), nodes, time.monotonic()),
+            "tilt": self._tilt.within(TIMING.silent),
+            **self._recordings.state(),
+        }
 
 
 def tilt_shown(message: Vector3Stamped) -> dict[str, float] | None:
