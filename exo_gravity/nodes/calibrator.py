@@ -137,8 +137,11 @@ class CalibratorNode(Node):
         level = ERROR if trouble else OK if self._began else WARN
         working = NodeState.MEASURING if self._began else NodeState.WAITING
         state = NodeState.WITHDRAWN if trouble else NodeState.DONE if tour.done else working
-        values = {"state": state, "poses": len(tour.measured)}
-        self._diagnostics.report(level, f"withdrawn: {trouble}" if trouble else progress, values)
+        self._diagnostics.report(
+            level,
+            f"withdrawn: {trouble}" if trouble else progress,
+            {"state": state, "poses": len(tour.measured)},
+        )
 
 
 def main() -> None:

@@ -307,8 +307,11 @@ class WearerNode(Node):
 
     def _silence(self) -> Reason:
         """Return who is silent, false if the compensator is not."""
-        is_heard = self._statuses.within(COMPENSATOR_SILENCE, self._status_name)
-        return NO_REASON if is_heard else Reason(NoEstimate.NO_COMPENSATOR, f"waiting for {self._status_name}")
+        return (
+            NO_REASON
+            if self._statuses.within(COMPENSATOR_SILENCE, self._status_name)
+            else Reason(NoEstimate.NO_COMPENSATOR, f"waiting for {self._status_name}")
+        )
 
     def _why_not(self, now: float) -> tuple[bytes, WearerState, Reason]:
         """Return level, state, and why nothing is estimated."""

@@ -43,8 +43,7 @@ LOG_LEVELS = ("debug", "info", "warn", "error", "fatal")
 
 def print_line(node: str, line: str) -> None:
     """Print one line of a node's log, with the time of day and the node's name."""
-    clock = datetime.now().time().isoformat("milliseconds")
-    print(f"{clock} {node.lstrip('/'):<18} {line}", flush=True)
+    print(f"{datetime.now().time().isoformat('milliseconds')} {node.lstrip('/'):<18} {line}", flush=True)
 
 
 def _arguments(args: Sequence[str] | None) -> argparse.Namespace:
@@ -87,7 +86,6 @@ def main(args: Sequence[str] | None = None) -> None:
     if os.environ.get("EXO_GRAVITY_SUPERVISED"):  # by `ros2 launch`, which holds our standard input open
         threading.Thread(target=_stop_with_parent, args=(stopping,), daemon=True).start()
     space, restarts = options.namespace.strip("/"), deque([-math.inf] * 3, maxlen=3)  # the latter in monotonic s
-    remaps = [word for rule in options.remap for word in ("-r", rule)]
     restrict_to_localhost()
     try:
         while True:
@@ -98,7 +96,7 @@ def main(args: Sequence[str] | None = None) -> None:
                 ["/panel"] if options.panel else [],
                 f"/{space}" if space else "",
                 options.one_process,
-                ["--log-level", options.log_level, *remaps],
+                ["--log-level", options.log_level, *(word for rule in options.remap for word in ("-r", rule))],
                 check_start,
             )
             if sentence := localhost_notice():

@@ -296,36 +296,38 @@ def test_an_executor_that_stood_still_knows_it_without_stamps_of_the_middleware(
     assert served.executor._age(SimpleNamespace()) >= 0.3
 
 
-def test_a_person_at_a_terminal_is_asked_once_for_each_question_and_their_yes_reaches_the_bridge(monkeypatch, capsys):
-    thread, asked, confirmed, reports = NodeThread("can_bridge", namespace="right"), [], [], itertools.count()
-    (bridge,) = thread.nodes
+# By the number of the report that it comes with: after a question was withdrawn, to the next one, and Ctrl-D.
+TYPED = {50: b"y\n", 70: b"y\n", 110: b"\x04"}
+
+
+def test_a_person_at_a_terminal_is_asked_once_for_each_question_and_their_yes_to_it_alone_reaches_the_bridge(
+    monkeypatch, capsys
+):
+    thread, confirmed, reports = NodeThread("can_bridge", namespace="right"), [], itertools.count()
+    (bridge,), (keys, stdin) = thread.nodes, os.openpty()
     statuses = bridge.create_publisher(DiagnosticArray, "/diagnostics", 1)
 
     def confirm(_request: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
-        confirmed.append(next(reports))
+        confirmed.append(next(reports) // 40)
         response.message = "confirmed (degrees)"
         return response
 
     def report() -> None:
-        is_asking = not confirmed or next(reports) > confirmed[0] + 10
-        pair = KeyValue(key=POSE_TO_CONFIRM, value="b 0, d 23" if is_asking else NO_POSE)
+        number = next(reports)
+        pair = KeyValue(key=POSE_TO_CONFIRM, value=f"b 0, d {number // 40}" if number % 40 > 20 else NO_POSE)
         statuses.publish(DiagnosticArray(status=[DiagnosticStatus(name="right/can_bridge", values=[pair])]))
-
-    def answer(question: str) -> str:
-        asked.append(question)
-        if confirmed:
-            raise EOFError
-        return "y"
+        os.write(keys, TYPED.get(number, b""))
 
     bridge.create_service(Trigger, "~/confirm_pose", confirm)
     bridge.create_timer(0.05, report)
-    monkeypatch.setattr("builtins.input", answer)
+    monkeypatch.setattr(sys, "stdin", os.fdopen(stdin))
     monkeypatch.setattr(sys, "argv", ["pose_prompt", "/right/can_bridge"])
     thread.start()
     pose_prompt.main()
     thread.close()
-    assert len(asked) == 2 and "/right/can_bridge: does the arm hang as it is drawn, joints at b 0, d 23" in asked[0]
-    assert "/right/can_bridge: confirmed (degrees)" in capsys.readouterr().out
+    said = capsys.readouterr().out
+    assert confirmed == [1] and said.count("/right/can_bridge: confirmed (degrees)") == 1
+    assert said.count("/right/can_bridge: does the arm hang as it is drawn, joints at b 0, d") == 3
 
 
 # Discovery, signals and the clock

@@ -431,8 +431,15 @@ class Tour:
                 self.trouble = f"{name}: {what}: the arm was touched, or the joint slips"
                 return
         weight, lever = self._load
-        kept = seen._replace(effort=effort, load_mass=weight, load_lever=lever, speed=station.speed)
-        self.measured.append(kept._replace(temperature=tuple(self.temperature)))
+        self.measured.append(
+            seen._replace(
+                effort=effort,
+                load_mass=weight,
+                load_lever=lever,
+                speed=station.speed,
+                temperature=tuple(self.temperature),
+            )
+        )
 
 
 class TourController(SampleController):
