@@ -292,10 +292,10 @@ class Control:
                 return self._answer(page, text, f"{other} holds control of this arm", 403)
             if kind == "open" and not is_here:
                 return self._answer(page, text, "only a browser on the panel's computer opens programs there", 403)
-        if kind in ("enable", "activate", "resume", "confirm_pose"):
-            if self.is_gone():  # the network may have kept the request back: nobody expects it any more
-                return self._answer(page, text, "this page has confirmed nothing for 2 s: look at the arm first", 403)
-            self.arms.lease(str(page), "hold")
+            if kind in ("enable", "activate", "resume", "confirm_pose"):
+                if self.is_gone():  # the network may have kept the request back: nobody expects it any more
+                    return self._answer(page, text, "this page was out of touch for 2 s: look at the arm first", 403)
+                self.arms.lease(str(page), "hold")
         try:
             problem = await self._carry_out(request, kind, arm, page)
         except ParameterError as error:
