@@ -2,10 +2,11 @@
 """Who operates the arms, and what a page may ask for.
 
 A page is one browser tab. It keeps its secret while it is reloaded, and confirms each few states that it receives. A
-page that confirms nothing for 2 s is gone: the laptop is closed, or the network lost. It starts no arm: its request may
-be as late. One page at a time holds control, the others watch. Every page may let the arms down at any time. Each
-confirmation of the page that holds control renews its lease at the arms (core/safety/lease.py), if the panel has one:
-no page, no panel, no lease. A request is an object such as {"do": "set", "arm": "right", "values": {"support": 0.3}}.
+page that confirms nothing for 2 s is gone: the laptop is closed, or the network lost. It may only let arms down: its
+request may be as late. One page at a time holds control, the others watch. Every page may let the arms down at any
+time. Each confirmation of the page that holds control renews its lease at the arms (core/safety/lease.py), if the panel
+has one: no page, no panel, no lease. A request is an object such as {"do": "set", "arm": "right", "values": {"support":
+0.3}}.
 """
 
 import asyncio
@@ -292,9 +293,9 @@ class Control:
                 return self._answer(page, text, f"{other} holds control of this arm", 403)
             if kind == "open" and not is_here:
                 return self._answer(page, text, "only a browser on the panel's computer opens programs there", 403)
-            if kind in ("enable", "activate", "resume", "confirm_pose"):
-                if self.is_gone():  # the network may have kept the request back: nobody expects it any more
-                    return self._answer(page, text, "this page was out of touch for 2 s: look at the arm first", 403)
+            if arm and self.is_gone():  # the network may have kept the request back: nobody expects it any more
+                return self._answer(page, text, "this page was out of touch for 2 s: look at the arm first", 403)
+            if kind in ("enable", "activate", "resume"):
                 self.arms.lease(str(page), "hold")
         try:
             problem = await self._carry_out(request, kind, arm, page)

@@ -123,7 +123,6 @@ def test_page_and_log_get_refusals_and_the_name_of_the_client_and_never_the_wear
     assert panel.notes[-1].endswith("enable right: refused: the arm is active")
 
 
-STARTS = [(kind, "right") for kind in ("enable", "activate", "resume", "confirm_pose")]
 OPERATED = [(kind, {"arm": "right"}) for kind in ("enable", "activate", "clear_fault", "resume", "confirm_pose")]
 FILED = [(kind, {}) for kind in ("record", "stop_recording", "save", "stop_trial")] + [("trial", {"name": "demo"})]
 
@@ -166,13 +165,15 @@ def test_control_is_taken_and_given_up_here_and_at_the_arms(panel):
     assert panel.holder is None
 
 
-def test_the_operators_page_is_gone_when_it_confirms_nothing_for_a_while_starts_no_arm_and_a_new_page_takes_over(panel):
+def test_the_operators_page_is_gone_when_it_confirms_nothing_for_a_while_may_only_let_down_and_a_new_page_takes_over(
+    panel,
+):
     assert GONE > LEASE_TIME + 0.1  # s between two looks of the bridge: the arm has been let down by then
     panel.now += GONE + 0.01
     panel.confirm(panel.second)
-    assert panel.is_gone() and [panel.status(panel.first, *start) for start in STARTS] == [403] * 4
+    assert panel.is_gone() and [panel.status(panel.first, kind, **more) for kind, more in OPERATED] == [403] * 5
     panel.confirm(panel.first)
-    assert not panel.is_gone() and panel.arms.calls == [] and panel.status(panel.first, *STARTS[0]) == 200
+    assert not panel.is_gone() and panel.arms.calls == [] and panel.status(panel.first, "enable", "right") == 200
     panel.now += GONE + 0.1
     assert panel.opened() is panel.holder
 

@@ -166,11 +166,11 @@ def test_the_page_shows_and_operates_an_arm_that_comes_and_goes_and_no_node_of_a
         arm.succeeds = iter((True, True, False, True, False, False))  # of one that is unconfigured, inactive, active
         assert page.ask("activate", arm="right") == page.ask("activate", arm="right") == (200, "")
         assert "could not be activated" in page.ask("activate", arm="right")[1]
-        arm.succeeds = (page.ask("let_down")[0] == 409 for _ in range(1))  # while the bridge opens its buses
-        assert page.ask("activate", arm="right") == (409, "the arm was asked to be let down")
         assert page.ask("set", arm="right", values={"support": 0.2}) == (200, "")
         # Also before the panel has heard of it
         assert page.get("settings/right").json() == {"settings": {"support": 0.2}}
+        arm.succeeds = (page.ask("let_down")[0] == 409 for _ in range(1))  # while the bridge opens its buses
+        assert page.ask("activate", arm="right") == (409, "the arm was asked to be let down")
         page.message("setup", lambda setup: is_known(setup, 0.2))
         assert page.ask("let_down") == (200, "")
         activated = [
