@@ -32,6 +32,7 @@ from exo_gravity.nodes.ros.parameters import declare, given_to
 from exo_gravity.nodes.ros.run import run
 from exo_gravity.nodes.ros.subscriptions import (
     NEWEST_ONLY,
+    SHORT_QUEUE,
     PeriodicThread,
     PolledSubscription,
     Publishers,
@@ -65,7 +66,8 @@ class CalibratorNode(Node):
         self._lock = threading.Lock()  # guards tilt and state: joint states arrive on another thread
         self._joint_states = PolledSubscription(self, JointState, "joint_states", self._on_joint_states, NEWEST_ONLY)
         if self._uses_imu:
-            self._sources |= TiltSubscription(self, self._tilt, self._lock, self._on_refused_tilt).senders
+            self._trunk = TiltSubscription(self, self._tilt, self._lock, self._on_refused_tilt, qos=SHORT_QUEUE)
+            self._sources |= self._trunk.senders
         self.create_subscription(DiagnosticArray, "/diagnostics", self._on_diagnostics, 10)
         self.create_timer(REPORT_PERIOD, self._report)
         # Poses are chosen on a thread of their own: neither joint states nor tilts may wait for it.
@@ -94,6 +96,8 @@ class CalibratorNode(Node):
             self._trouble, effort = f"joint_states: {error}", None
         self._command.effort = effort or ()
         self._publisher.publish(self._command)
+        if self._uses_imu:
+            self._trunk.poll()
 
     def _effort(self, position: tuple[float, ...], velocity: tuple[float, ...]) -> Torque | None:
         """Return the effort (n,) in Nm, None to withdraw."""

@@ -103,8 +103,7 @@ class Trunk:
         self._side = settings.side
         self.tilt = TiltInput(settings.side, settings.tilt_timeout)
         self._felt_at, self._force, self._rate = -math.inf, ZERO, ZERO  # monotonic s, m/s^2, rad/s
-        on_motion = self._on_motion
-        self._subscription = TiltSubscription(node, self.tilt, threading.Lock(), on_motion=on_motion, is_polled=True)
+        self._subscription = TiltSubscription(node, self.tilt, threading.Lock(), on_motion=self._on_motion)
 
     def at(self, now: float) -> tuple[Tilt, Floats3, Tilt] | None:
         """Return the tilt of what the trunk feels as gravity, its angular velocity, and the tilt of gravity alone.

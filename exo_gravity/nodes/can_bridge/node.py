@@ -76,7 +76,7 @@ def _gravity_for(node: Node, get_loop: Callable[[], ControlLoop | None], is_moni
         if loop := get_loop():
             loop.safety.motion.follow(now, tilt.at(now), tilt.overtaken)
 
-    return TiltSubscription(node, tilt, threading.Lock(), on_tilt=pass_on, is_polled=True)
+    return TiltSubscription(node, tilt, threading.Lock(), on_tilt=pass_on)
 
 
 def _transition(function: Callable[[Any], None]) -> Callable[..., TransitionCallbackReturn]:

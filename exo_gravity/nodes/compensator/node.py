@@ -10,7 +10,7 @@ import math
 import threading
 import time
 from collections import deque
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from functools import partial
 from typing import Any
 
@@ -87,12 +87,17 @@ class CompensatorNode(Node):
         topic = self._interface.topic
         self._source = Publishers()
         self._sources = {topic: self._source}  # of what the torque depends on
-        quality = SHORT_QUEUE if is_called else NEWEST_ONLY
-        self._joint_states = PolledSubscription(self, JointState, topic, self._on_joint_states, quality, raw=is_called)
+        self._joint_states = PolledSubscription(
+            self, JointState, topic, self._on_joint_states, SHORT_QUEUE if is_called else NEWEST_ONLY, raw=is_called
+        )
         self._threads.append(self._joint_states)
+        self._poll_tilt: Callable[[], None] = lambda: None
         if values["use_imu"]:
-            tilt = TiltSubscription(self, self._control.tilt, self._lock, self._refused, self._on_motion)
+            tilt = TiltSubscription(
+                self, self._control.tilt, self._lock, self._refused, self._on_motion, qos=SHORT_QUEUE
+            )
             self._sources |= tilt.senders
+            self._poll_tilt = tilt.poll
         accept_changes(self, table, read, self._apply)
         # Only the executor's thread reports: diagnostics are not for two threads.
         self._changed = self.create_guard_condition(self._report_changes)
@@ -182,6 +187,7 @@ class CompensatorNode(Node):
             self._changes.append(answer)
         if changed or self._control.lost:
             self._changed.trigger()
+        self._poll_tilt()  # the answer does not wait for it: a tilt is turned on by its angular velocity
         return efforts
 
     def _on_assist_efforts(self, message: JointState, info: dict[str, Any]) -> None:

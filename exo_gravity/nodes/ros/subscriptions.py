@@ -171,8 +171,7 @@ class TiltSubscription:
     on_refusal(topic, error): a message is impossible; the last tilt then grows old.
     on_motion(now, force, rate, age): the trunk's motion, in its axes: s, m/s^2 (3,), rad/s (3,), s.
     on_tilt(now): `target` has a message of `now`, s.
-    senders: the publishers by topic.
-    is_polled: messages are taken in `poll`, not by the executor.
+    Messages are taken in `poll` alone. qos: a deeper queue lets `senders`, the publishers by topic, tell two apart.
     """
 
     def __init__(
@@ -183,22 +182,20 @@ class TiltSubscription:
         on_refusal: Callable[[str, ParameterError], object] = lambda topic, error: None,
         on_motion: Callable[..., object] = lambda *sample: None,
         on_tilt: Callable[[float], object] = lambda now: None,
-        is_polled: bool = False,
+        qos: QoSProfile = NEWEST_ONLY,
     ) -> None:
         self._node, self._target, self._lock = node, target, lock
         self._on_refusal, self._on_motion, self._on_tilt = on_refusal, on_motion, on_tilt
         self.senders = {topic: Publishers() for topic in (DATA, PITCH_YAW)}
-        self._polled: list[PolledSubscription] = []
-        for msgtype, topic, callback in ((Imu, DATA, self._on_data), (Vector3Stamped, PITCH_YAW, self._on_pitch_yaw)):
-            if is_polled:
-                self._polled.append(PolledSubscription(node, msgtype, topic, callback))
-            else:
-                node.create_subscription(msgtype, topic, callback, NEWEST_ONLY)
+        self._topics = (
+            PolledSubscription(node, Imu, DATA, self._on_data, qos),
+            PolledSubscription(node, Vector3Stamped, PITCH_YAW, self._on_pitch_yaw, qos),
+        )
 
     def poll(self) -> None:
-        """Take the newest message of each topic, if it is new."""
-        for path in self._polled:
-            path.poll()
+        """Take the newest messages of each topic, on the caller's thread."""
+        for topic in self._topics:
+            topic.poll()
 
     def _on_data(self, message: Imu, info: dict[str, Any]) -> None:
         if message.orientation_covariance[0] == NOT_REPORTED:
