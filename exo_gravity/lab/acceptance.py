@@ -196,10 +196,13 @@ def cold(bench: Bench) -> BenchStep:
     bench.until(lambda: all(sample.time > -math.inf for sample in bench.loop.samples), ACCEPTANCE.start)
     read = [sample.temperature for sample in bench.loop.samples]
     known = [degrees for degrees in read if degrees is not None]
-    passed = len(known) == len(read) and CHECK.coldest <= min(known) <= max(known) <= CHECK.hottest
-    passed = passed and max(known) - min(known) <= ACCEPTANCE.spread
     shown = ", ".join("none" if degrees is None else str(degrees) for degrees in read)
     expected = f"must be {CHECK.coldest} to {CHECK.hottest} degC, and within {ACCEPTANCE.spread} K of each other"
+    passed = (
+        len(known) == len(read)
+        and CHECK.coldest <= min(known) <= max(known) <= CHECK.hottest
+        and max(known) - min(known) <= ACCEPTANCE.spread
+    )
     return BenchStep("cold", passed, f"the motors read {shown} degC: {expected}", {"temperature_degC": read})
 
 
@@ -316,7 +319,8 @@ def accept(bench: Bench, say: Callable[[str], None]) -> list[BenchStep]:
                 break
     finally:
         bench.loop.call(lambda: bench.loop.safety.disable(bench.clock.monotonic()))
-        bench.until(lambda: bench.loop.is_off, ACCEPTANCE.down)
+        if not bench.until(lambda: bench.loop.is_off, ACCEPTANCE.down):
+            say("the motors may still be on: cut their supply")
     return results
 
 

@@ -4,6 +4,7 @@
 import json
 from collections.abc import Callable
 from dataclasses import replace
+from unittest.mock import Mock
 
 import pytest
 
@@ -69,8 +70,7 @@ def acceptance(
     person.arm = played = VirtualArm(device, lift, motors, arm.limits, rate)
     bench = Bench(played.loop, motors, model_of(arm), weight, played.run, person.ask)
     results = accept(bench, person.said.append)
-    assert not device.powered
-    assert len(person.said) == len(results)
+    assert not device.powered and len(person.said) == len(results)
     played.bus.stop()
     return results
 
@@ -89,33 +89,34 @@ def test_a_device_as_its_file_says_passes_every_step_and_leaves_a_record():
     assert (
         written["passed"] and written["source"] == "simulated" and [step["name"] for step in written["steps"]] == NAMES
     )
-    measured = results[NAMES.index("torque")].measured
-    assert measured["ratio"] == pytest.approx(1.0, abs=0.15)
+    assert results[NAMES.index("torque")].measured["ratio"] == pytest.approx(1.0, abs=0.15)
     assert not record(results[:-1], "right", Source.REAL)["passed"]  # a step is missing
 
 
-HUNG = [(ON_URDF, "", ""), (Weight(0.05, 0.02), "torque", "must be at least 0.3: take a heavier one")]
-
-
-@pytest.mark.parametrize(("weight", "step", "said"), quick(HUNG[1:], HUNG))
-def test_an_arm_from_a_urdf_passes_every_step_and_a_weight_that_its_last_joint_hardly_feels_is_refused(
-    weight, step, said
-):
-    results = acceptance("three_joints", weight)
-    assert failed(results) == step and said in results[-1].sentence
-
-
-SPOILT = {  # what is the case, the step that fails, and what is said
+CASES = {  # what is the case, the step that fails, and what is said
     "a cold motor without the offset of its temperature": ({"cold": -15.0}, "cold", ""),
     "a supply that was not switched": ({"forgets": True}, "zero", ""),
+    "a weight that the last joint of an arm from a URDF hardly feels": (
+        {"name": "three_joints", "weight": Weight(0.05, 0.02)},
+        "torque",
+        "must be at least 0.3: take a heavier one",
+    ),
+    "an arm from a URDF, as its file says": ({"name": "three_joints", "weight": ON_URDF}, "", ""),
     "weak motors": ({"torque_scale": [0.6] * 4}, "torque", "ratio"),
     "no time-out": ({"assumed_timeout": 0.2}, "time_out", "the motor held; it must let go"),
     "a time-out": ({"assumed_timeout": 0.0, "firmware.timeout": 0.2}, "time_out", "the motor let go; it must hold"),
 }
 
 
-@pytest.mark.parametrize("case", quick(list(SPOILT)[:2], SPOILT))
+@pytest.mark.parametrize("case", quick(list(CASES)[:3], CASES))
 def test_what_is_not_as_the_file_says_fails_at_its_step(case):
-    spoil, step, said = SPOILT[case]
-    results = acceptance(**spoil)
+    given, step, said = CASES[case]
+    results = acceptance(**given)
     assert failed(results) == step and said in results[-1].sentence
+
+
+def test_a_person_who_breaks_off_is_told_of_motors_that_stay_on():
+    said = Mock()
+    with pytest.raises(KeyboardInterrupt):
+        accept(Mock(**{"ask.side_effect": KeyboardInterrupt, "until.return_value": False}), said)
+    assert "cut their supply" in said.call_args[0][0]
