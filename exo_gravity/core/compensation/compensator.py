@@ -146,7 +146,7 @@ class Compensator:
             late_tilt = f"{late}: held on, torque off by at most {turn * self._largest_torque(theta):.2f} Nm"
         self._follow_request(now)
         at = Reading(now, theta, velocity, self.tilt.at(now))
-        if self.settings.payload.mass and velocity:
+        if (self._pending or self.settings).payload.mass and velocity:
             self._withdraw_lost_load(at, velocity)
         before = self._loads_before()
         was_replaced = bool(self._fallback)
