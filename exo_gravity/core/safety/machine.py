@@ -204,11 +204,10 @@ class SafetyMachine:
         watch.read(now, joints, self.held_back, self._sent.powered, self._dt)
         if self._left:
             self._share_supply(self._left)
-        missing = self._look(efforts) if self._is_standing else NO_REASON
-        if self.state is State.CHECKING:
-            self._check(missing, efforts.effort)
-        elif self.state in CARRYING:
+        if self.state in CARRYING:
             self._latch(self._carried_fault(efforts), self._now)
+        elif self._is_standing:
+            self._look(efforts)
         self._latch(watch.judge_pause(now, self._sent.effort, self.state in CARRIED), now)
         effort = efforts.effort
         if effort is not None and self.state in CARRIED:
@@ -271,8 +270,8 @@ class SafetyMachine:
             is_unproven=not watch.trusted and any(motor.power is Power.ENTERING for motor in watch.joints),
         )
 
-    def _look(self, efforts: Efforts) -> Fault | Reason:
-        """Return what an arm that is off lacks for a start, and note since when it has been calm, enabled or not.
+    def _look(self, efforts: Efforts) -> None:
+        """Note since when an arm that is off has been calm, enabled or not; if it is, check it for a start.
 
         Efforts may be late as they may while the arm is carried, but not in the cycle in which the checks end.
         """
@@ -289,7 +288,8 @@ class SafetyMachine:
             missing = Reason(Wait.EFFORTS, "effort commands")
             # While an IMU settles, the compensator answers in time without efforts.
             self._calm_since = max(self._calm_since, self._now + START_GATE.efforts - START_GATE.calm)
-        return missing
+        if self.state is State.CHECKING:
+            self._check(missing, efforts.effort)
 
     def _check(self, missing: Fault | Reason, effort: Sequence[float] | None) -> None:
         """Continue to PROVING once all has been well for a while, or trip on a fault that refuses the start."""
