@@ -14,7 +14,7 @@ unexport PYTHONDONTWRITEBYTECODE
 help:  # these lines
 	@sed -nE 's/^([a-z-]+):[^#]*# (.*)/make \1\t\2/p' $(MAKEFILE_LIST) | expand -t 18
 
-demo:  # all nodes as processes on the simulated device, 100 s; a table and figures in trials/
+demo:  # all nodes as processes on the simulated device, 70 s; a table and figures in trials/
 	@$(SETUP) @demo
 	$(BIN)/trial demo
 

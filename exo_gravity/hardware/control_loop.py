@@ -110,7 +110,7 @@ class ControlLoop:
         self.cycle_errors, self.cycle_error = 0, ""
         #: The exception that ended the control, if any.
         self.failure: BaseException | None = None
-        #: What a start waits for besides the boards of the motors, set from outside; false for nothing.
+        #: What else a start waits for, apart from the motors' boards: set from outside, false if there is nothing.
         self.setup_error = NO_REASON
         #: s, of the owner's last sign of life; inf if it gives none. One that stands still could not let the arm down.
         self.attended = math.inf

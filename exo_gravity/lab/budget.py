@@ -235,8 +235,8 @@ def arm_budget(
 ) -> ArmBudget:
     """Return the budget of an arm that carries `support` (0..1) of the wearer's arm and `payload` kg in the hand.
 
-    wearer: None if nobody wears it. max_tilt: of the trunk, rad. Raises ParameterError if the wearer does not fit the
-    robot.
+    wearer: None for an arm that is not worn. max_tilt: of the trunk, rad. Raises ParameterError if the wearer does not
+    fit the robot.
     """
     values, motors = configured.compensator, configured.can_bridge["motor"]
     names = [name.removeprefix(f"{configured.side}_") for name in configured.joint_names]

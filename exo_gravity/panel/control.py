@@ -293,7 +293,7 @@ class Control:
                 return self._answer(page, text, f"{other} holds control of this arm", 403)
             if kind == "open" and not is_here:
                 return self._answer(page, text, "only a browser on the panel's computer opens programs there", 403)
-            if arm and self.is_gone():  # the network may have kept the request back: nobody expects it any more
+            if arm and self.is_gone():  # the network may have delayed the request
                 return self._answer(page, text, "this page was out of touch for 2 s: look at the arm first", 403)
             if kind in ("enable", "activate", "resume"):
                 self.arms.lease(str(page), "hold")

@@ -24,7 +24,7 @@ def _arguments(args: Sequence[str] | None) -> argparse.Namespace:
     parser = argparse.ArgumentParser(prog="budget", description="Torque that a wearer's arm requires of each motor.")
     option = parser.add_argument
     option("--params", required=True, metavar="FILE", help="ROS 2 parameter file with the arms")
-    option("--body-mass", type=float, metavar="KG", help="body mass of the wearer (the file's); 0: nobody wears it")
+    option("--body-mass", type=float, metavar="KG", help="the wearer's body mass (default: the file's); 0: no wearer")
     option("--sex", default="male", choices=SEX, help="sex of the wearer (%(default)s)")
     option("--table", default="de_leva", choices=tuple(TABLES), help="body segment parameters (%(default)s)")
     option(
@@ -62,7 +62,7 @@ def _run(options: argparse.Namespace) -> int:
         segments = ", ".join(f"{name} {mass:.2f} kg at {cog:.3f} m" for name, (mass, cog) in masses)
         print(f"Wearer: {wearer.body_mass:g} kg, {wearer.sex}, table {wearer.table}: {segments}")
     zero_g = "Full Zero-G" if support == 1.0 else f"Support {support:g}"
-    carried = f"{zero_g} of a wearer of {mass:g} kg" if wearer else "The arm alone, which nobody wears,"
+    carried = f"{zero_g} of a wearer of {mass:g} kg" if wearer else "The arm without a wearer"
     held = f" with {options.payload:g} kg in the hand" if options.payload else ""
     alike: dict[str, list[ArmBudget]] = {}  # one table names all arms that share it, as mirrored ones do
     for arm in arms:

@@ -308,7 +308,7 @@ def test_a_wearers_data_ask_first_while_an_arm_is_carried_and_lower_the_support_
     stage.arms.calls.clear()
     stage.arms.states["right"] = "active"
     right.update({"mode": "zero_g", "support": 1.0, "wearer.body_mass": 0.0, "wearer.first_moment": [0.2] * 4})
-    wait_for_text(page, "#chips .badge", "Zero-G, 0 %")  # of nobody's arm
+    wait_for_text(page, "#chips .badge", "Zero-G, 0 %")  # no wearer is entered
     give_wearer(page, "62")
     assert stage.arms.calls == []
     confirm(page, "may move slowly")

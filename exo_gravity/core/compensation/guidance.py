@@ -68,8 +68,8 @@ class TouchLimits:
     least: float = 0.2  #: and Nm, which friction and model errors may amount to
     time: float = 0.1  #: s for which no joint is touched; 0.05 is the longest of 500 reaches and other motions
     slow: float = 1.0  #: rad/s, below which no brake acts, so that the motors should apply what is asked of them
-    #: s, of an arm that has been faster since its motors did not. A hand that lifts it and a brake that takes all of
-    #: the torque may balance for a moment
+    #: s, the same where the motors did not when the arm was last slower: the brake may cancel the torque for a moment
+    #: while a hand lifts the arm
     fast: float = 0.25
 
 

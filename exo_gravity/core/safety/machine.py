@@ -89,7 +89,7 @@ class SafetyMachine:
         #: the last hand on every command
         self.shaper = Shaper(limits, [motor.peak_damping for motor in motors] or [math.inf] * count)
         self.watch = ArmWatch(limits, period, motors)
-        self._since, self._calm_since = 0.0, math.inf
+        self._since, self._calm_since = 0.0, math.inf  # s; the latter infinite until an arm that is off is looked at
         self._now, self._dt = -math.inf, 0.0  # of the present cycle
         self._sent = self._off = Command.off(count)  # last sent to the motors
         self._descent = ArmDescent(0.0, self._none, self._none, self._none)

@@ -5,8 +5,8 @@ Readings. After power-up a motor knows its angle modulo a turn of its rotor only
 40 at an AK80-9. So zeros and signs are proven while the arm hangs. A proof holds for as long as the angles are
 continuous, and that is judged here alone, whichever fault lets the arm down. They are no longer continuous when
 
-- a motor may have lost its power: it was silent for long enough to restart, nobody looked for a while, or it has come
-  back from a shorter silence at an angle that its velocity does not explain;
+- a motor may have lost its power: it was silent for long enough to restart, the loop stood still for a second, or the
+  motor has come back from a shorter silence at an angle that its velocity does not explain;
 - an angle jumps, or a joint turns faster than `max_velocity`: an encoder that slips looks like a joint that is thrown;
 - angle and velocity contradict each other: a wrong `velocity_range` or sign, a frozen angle, a slow slip;
 - a motor reports an error;

@@ -77,7 +77,7 @@ class Fit:
     moment: float = 0.02  #: kg m, in addition: off-axis moments of which the file knows nothing
     scale: float = 0.3  #: of a torque scale; users report 0.75
     offset: float = 0.3  #: Nm
-    beside: float = 0.05  #: rad, by which a known weight may lie beside its link; 3 degrees
+    beside: float = 0.05  #: rad, of the direction in which a known weight hangs from its joint; 3 degrees
     #: rad about each axis, of gravity's measured direction: an IMU's mounting, mostly its heading
     tilt: float = 0.05
     spring: float = 0.09  #: Nm/rad: cables of up to 0.15
@@ -180,7 +180,7 @@ class Rows(NamedTuple):
     warmth: np.ndarray  #: (m, n) K of the motors, beyond the mean of their poses; 0 where it is not known
     direction: np.ndarray  #: (m, 3), gravity's unit vector in the base frame, as measured
     load: np.ndarray  #: (m, k) kg m, moments of the weight
-    beside: np.ndarray  #: (m, k, a) kg m per rad, how these moments change with the angles of a weight
+    beside: np.ndarray  #: (m, k, a) kg m per rad, derivative of these moments by the angles of the weight
     layout: FitLayout
 
     def only(self, keep: np.ndarray) -> "Rows":

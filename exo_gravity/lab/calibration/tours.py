@@ -513,7 +513,7 @@ class WearerPrior:
     """What is known of a person's relaxed arm before a pose is measured, as standard errors, and what is plausible."""
 
     mass: float = 0.5  #: share of the table's mass of a segment
-    moment: float = 10.0  #: kg m, besides
+    moment: float = 10.0  #: kg m, of a moment by itself: so wide that only the segments' masses and places tell
     place: float = 0.05  #: m, of a segment's centre of gravity in each direction
     stiffness: float = 1.5  #: Nm/rad, of a relaxed shoulder or elbow
     middle: float = 1.0  #: Nm, of its torque in the middle of the poses

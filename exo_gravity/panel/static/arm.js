@@ -95,7 +95,7 @@ export class ArmCard {
     return this.setup?.settings?.support ?? NaN;
   }
 
-  // The share of the wearer's arm that the motors carry: none in One-G, or of nobody.
+  // The share of the wearer's arm that the motors carry: none in One-G, or without a wearer.
   get carriedShare() {
     return this.mode === "zero_g" && this.hasWearer ? this.support : 0;
   }
