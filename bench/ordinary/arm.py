@@ -72,11 +72,6 @@ class OrdinaryMotor(SimulatedMotor):
         self._electronics = electronics
         self._speed = 0.0  # rad/s, filtered
 
-    @property
-    def steady(self) -> bool:
-        """Whether the torque stays constant: not while the current loop follows."""
-        return False
-
     def advance(self, position: float, velocity: float, dt: float) -> float:
         """Let `dt` s pass, and return the torque in Nm; see `SimulatedMotor.advance`."""
         if self.firmware.timeout:  # it counts the time since the last command

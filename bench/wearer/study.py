@@ -91,10 +91,6 @@ class Muscles(VirtualWearer):
         self._from: Sequence[float] = NO_TORQUE
         self._index, self._end = -1, sum(phase.move + phase.hold for phase in phases)
 
-    def idle(self, elapsed: float, duration: float) -> bool:
-        """Return False: the muscles always have a torque."""
-        return False
-
     def torque(self, elapsed: float, theta: Sequence[float], velocity: Sequence[float]) -> Torque:
         """Return the wearer's torque (4,) in Nm."""
         super().torque(elapsed, theta, velocity)  # follows the script's steps

@@ -85,14 +85,6 @@ class VirtualWearer:
             return tuple(share * torque for torque in step.value)
         return nothing
 
-    def idle(self, elapsed: float, duration: float) -> bool:
-        """Return whether the wearer applies no torque for `duration` s from `elapsed` s after the start."""
-        index, since = self.script.at(elapsed)
-        if elapsed < 0.0 or index == len(self.script.steps):
-            return elapsed + duration <= 0.0 or elapsed >= 0.0
-        step = self.script.steps[index]
-        return index == self.step and step.action == "hold" and since + duration <= step.duration
-
     def lead(self, path: Course, theta: Sequence[float], velocity: Sequence[float], period: float) -> Torque:
         """Return the torque (n,) in Nm of a hand that leads the joints along `path`; period: s since the last call."""
         torque, limit = [], self.strength
@@ -144,53 +136,41 @@ FLUSH_PERIOD = 0.02  # s
 
 
 class TruthRecords:
-    """Keeps the records in memory, by simulated time: for a judge in the same process."""
+    """The records: in memory and by simulated time, for a judge in the same process, or in the file at `path`.
 
-    def __init__(self) -> None:
+    Raises ParameterError if the file cannot be created.
+    """
+
+    def __init__(self, path: str | Path = "") -> None:
         self._rows: list[tuple[Any, ...]] = []
-
-    def synchronise(self, now: float) -> None:
-        """Do nothing: the records have the simulated time."""
-
-    def note(self, now: float, *state: Any) -> None:
-        """Append the `state` of the arm at the simulated time `now` (s): the fields of RECORD from position on."""
-        self._rows.append((now, *state))
-
-    @property
-    def records(self) -> np.ndarray:
-        """All records so far, (n,) of RECORD."""
-        records = np.empty(len(self._rows), record_of(len(self._rows[0][1])) if self._rows else RECORD)
-        for name, column in zip(records.dtype.names or (), zip(*self._rows, strict=True), strict=False):
-            records[name] = column
-        return records
-
-
-class TruthLog:
-    """Writes the file at `path`. Raises ParameterError if it cannot be created."""
-
-    def __init__(self, path: str | Path) -> None:
+        self._offset = 0.0  # of the records' time to the simulated one, s
+        self._flushed = 0.0
         try:
-            self._file = open(path, "wb", buffering=0)  # noqa: SIM115, open as long as the process runs
+            self._file = open(path, "wb", buffering=0) if path else None  # noqa: SIM115, as long as the process runs
         except OSError as error:
             raise ParameterError("truth", str(path), f"a file that can be written ({error.strerror})") from None
-        self._rows = bytearray()
-        self._record: np.dtype | None = None
-        self._offset = 0.0  # wall clock minus simulated time, s
-        self._flushed = 0.0
 
     def synchronise(self, now: float) -> None:
         """Note that the simulated time `now` (s) is the present time."""
-        self._offset = time.time() - now
+        if self._file:
+            self._offset = time.time() - now
 
     def note(self, now: float, *state: Any) -> None:
         """Append the `state` of the arm at the simulated time `now` (s): the fields of RECORD from position on."""
         stamp = now + self._offset
-        self._record = self._record or record_of(len(state[0]))
-        self._rows += np.array((stamp, *state), self._record).tobytes()
-        if abs(stamp - self._flushed) >= FLUSH_PERIOD:
+        self._rows.append((stamp, *state))
+        if self._file and abs(stamp - self._flushed) >= FLUSH_PERIOD:
             self._flushed = stamp
-            self._file.write(self._rows)
+            self._file.write(self.records.tobytes())
             self._rows.clear()
+
+    @property
+    def records(self) -> np.ndarray:
+        """The records that are in memory, (n,) of RECORD."""
+        records = np.empty(len(self._rows), record_of(len(self._rows[0][1])) if self._rows else RECORD)
+        for name, column in zip(records.dtype.names or (), zip(*self._rows, strict=True), strict=False):
+            records[name] = column
+        return records
 
 
 MAX_CATCH_UP = 0.05  # s of physics simulated at once; after a longer stall the rest of the time is lost
@@ -215,7 +195,7 @@ class SimulatedDevice:
         self.cut_off: Sequence[bool] = (False,) * count  #: the same for each motor
         self.mute: Sequence[bool] = (False,) * count  #: whether a motor's replies are lost, while it obeys
         self.encoder_error: Sequence[float] = (0.0,) * count  #: rad, added to the angle that a motor reads
-        self.truth: TruthRecords | TruthLog | None = None  #: receives every physics step
+        self.truth: TruthRecords | None = None  #: receives every physics step
         self.slip = 0.0  #: s that `run` has lost against real time
         #: s since the motors were switched on, between two passes of `run`, and in which no command arrived
         self.longest_stall = self.longest_silence = 0.0
@@ -270,12 +250,8 @@ class SimulatedDevice:
         self._move_base(self.trunk)
         if self.truth:
             self.truth.synchronise(self._clock)
-        steps = int((self._clock - self.time) / STEP + 1e-6)
-        # While no torque changes, MuJoCo can make all steps at once.
-        is_idle = self.truth is None and self.wearer.idle(self.time - self._script_start, steps * STEP)
-        at_once = max(1, steps) if is_idle and all(motor.steady for motor in self.motors) else 1
-        for _ in range(0, steps, at_once):
-            self._step(self.arm.positions, self.arm.velocities, at_once)
+        for _ in range(int((self._clock - self.time) / STEP + 1e-6)):
+            self._step(self.arm.positions, self.arm.velocities)
 
     def exchange(self, can_id: int, data: bytes) -> Frame | None:
         """Pass the frame `data` with arbitration ID `can_id` to the motors; return (ID, data) of the reply, if any."""
@@ -401,7 +377,7 @@ class SimulatedDevice:
             self._base = state
             self.arm.move_base(*self.arm.config.felt(self.side, state))
 
-    def _step(self, theta: list[float], velocity: list[float], count: int) -> None:
+    def _step(self, theta: list[float], velocity: list[float]) -> None:
         now, arm = self.time, self.arm
         for joint, returns in enumerate(self._power_returns):
             if now >= returns:
@@ -409,7 +385,7 @@ class SimulatedDevice:
                 self.motors[joint].unplugged = False
         angles, speeds = (arm.motor_positions, arm.motor_velocities) if arm.is_elastic else (theta, velocity)
         at = zip(self.motors, angles, speeds, strict=True)
-        torque = [motor.advance(angle, speed, count * STEP) for motor, angle, speed in at]
+        torque = [motor.advance(angle, speed, STEP) for motor, angle, speed in at]
         elapsed = now - self._script_start
         given = self.wearer.torque(elapsed, theta, velocity)
         self._follow_trunk(elapsed)
@@ -422,8 +398,8 @@ class SimulatedDevice:
         if any(damping):
             each = zip(damping, self.motors, torque, strict=True)
             prompt = [own if own and motor.damps_at_once(pull) else 0.0 for own, motor, pull in each]
-        arm.step(list(map(operator.add, torque, given)), count, torque, prompt)
-        self._steps += count
+        arm.step(list(map(operator.add, torque, given)), of_motors=torque, damping=prompt)
+        self._steps += 1
 
 
 def _next(buses: list[can.BusABC], timeout: float) -> tuple[can.BusABC, float]:

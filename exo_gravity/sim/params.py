@@ -15,7 +15,7 @@ from exo_gravity.core.numbers import JOINT_COUNT
 from exo_gravity.core.params import Param, param_of, params_of, table_for
 from exo_gravity.hardware.urdf_arm import read_urdf
 from exo_gravity.sim.arm import DEFAULT_LINKS, ArmConfig, JointConfig, SimulatedArm
-from exo_gravity.sim.device import SimulatedDevice, TruthLog
+from exo_gravity.sim.device import SimulatedDevice, TruthRecords
 from exo_gravity.sim.motors import class_of, simulated
 from exo_gravity.sim.motors.ak import FIRMWARES, Firmware, Heat
 from exo_gravity.sim.trunk_motion import ImuConfig
@@ -159,7 +159,7 @@ def device_of(values: Mapping[str, Any]) -> SimulatedDevice:
     if "home" in values:
         arm.reset(values["home"])
     if values["truth"]:
-        device.truth = TruthLog(values["truth"])
+        device.truth = TruthRecords(values["truth"])
     return device
 
 

@@ -95,9 +95,7 @@ class VirtualArm:
 
     def run(self, duration: float) -> None:
         """Run the loop for `duration` s, or until it has ended."""
-        end = self.now + duration
-        while self.now < end and self.cycle():
-            pass
+        self.run_until(lambda: False, duration)
 
     def run_until(self, condition: Callable[[], object], timeout: float = 60.0) -> bool:
         """Run the loop until `condition()` holds; return whether it did within `timeout` s, before the loop ended."""

@@ -11,7 +11,7 @@ from exo_gravity.core.errors import ParameterError
 from exo_gravity.core.motors.ak import MIT
 from exo_gravity.core.motors.frames import ENTER
 from exo_gravity.sim import device as device_module
-from exo_gravity.sim.device import RECORD, TruthLog
+from exo_gravity.sim.device import RECORD, TruthRecords
 from exo_gravity.sim.judge import driven, measure
 
 from ..support.simulated_device import joints_of, make_device
@@ -140,7 +140,7 @@ def test_what_motors_did_to_the_arm_is_told_from_what_a_hand_gravity_or_a_stop_d
 def test_every_physics_step_is_logged_with_wall_time_motion_torque_damping_and_motor_state(tmp_path, monkeypatch):
     monkeypatch.setattr(device_module, "time", SimpleNamespace(time=lambda: 5000.0))
     device, log = make_device(), Truth(tmp_path / "truth.bin")
-    device.truth = TruthLog(log.path)
+    device.truth = TruthRecords(log.path)
     device.arm.reset((0.0, 1.0, 0.0, 0.0))
     device.exchange(2, joints_of((MIT,) * 4)[1].command(2.0, 1.5))
     device.exchange(2, ENTER)
@@ -155,4 +155,4 @@ def test_every_physics_step_is_logged_with_wall_time_motion_torque_damping_and_m
     np.testing.assert_allclose(effort, 2.0, atol=0.02)
     np.testing.assert_allclose(records["weight"][-1], device.arm.weight, atol=0.02)
     with pytest.raises(ParameterError, match="truth"):
-        TruthLog(tmp_path / "missing" / "truth.bin")
+        TruthRecords(tmp_path / "missing" / "truth.bin")

@@ -28,9 +28,6 @@ class ActiveWearer(VirtualWearer):
     def torque(self, elapsed: float, theta: Joints, velocity: Joints) -> tuple[float, ...]:
         return tuple(self._behaviour(elapsed, theta, velocity)) if elapsed >= 0.0 else NO_TORQUE
 
-    def idle(self, elapsed: float, duration: float) -> bool:
-        return False
-
 
 def attach(device: SimulatedDevice, behaviour: Behaviour, delay: float = 0.0) -> None:
     """Let a wearer act on the arm of `device` in `delay` s, in place of any other."""

@@ -255,13 +255,6 @@ class SimulatedMotor:
         """The torque that it gives at its temperature per commanded torque."""
         return self.joint.scale_at(self.temperature)
 
-    @property
-    def steady(self) -> bool:
-        """Whether the torque stays constant until the next frame, however the joint moves."""
-        if self.unplugged or not self.entered:
-            return not self.unplugged and not self._heat.rise
-        return not (self._command.kp or self._command.kd or self.firmware.timeout or self._heat.rise)
-
     def receive(
         self, data: bytes, position: float, velocity: float, now: float, frame_id: int | None = None
     ) -> bytes | None:

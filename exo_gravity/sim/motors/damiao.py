@@ -76,11 +76,6 @@ class DamiaoMotor(SimulatedMotor):
         """Return the firmware of a motor whose time-out is set as the file says."""
         return replace(DAMIAO, timeout=joint.timeout)
 
-    @property
-    def steady(self) -> bool:
-        """Whether the torque stays constant until the next frame: a motor that is on may let go."""
-        return self.unplugged or not (self.entered or self._heat.rise)
-
     def receive(
         self, data: bytes, position: float, velocity: float, now: float, frame_id: int | None = None
     ) -> bytes | None:
