@@ -217,14 +217,16 @@ def zero(bench: Bench) -> BenchStep:
         return f"{len(silent)} of {len(bench.motors)} motors were silent"
 
     bench.ask("let the arm hang, hands off; switch the motors' supply off and on", watch)
-    bench.until(lambda: all(bench.clock.monotonic() - one.time < 0.1 for one in bench.loop.samples), ACCEPTANCE.start)
+    now = bench.clock.monotonic
+    is_back = bench.until(lambda: all(now() - one.time < 0.1 for one in bench.loop.samples), ACCEPTANCE.start)
     after, limits = bench.angles, bench.loop.safety.limits
-    moved = max(abs(now - then) for now, then in zip(after, before, strict=True))
+    moved = max(abs(angle - then) for angle, then in zip(after, before, strict=True))
     columns = zip(after, limits.home, limits.home_tolerance, strict=True)
     is_home = all(abs(angle - home) <= most for angle, home, most in columns)
-    passed = len(silent) == len(bench.motors) and moved <= ACCEPTANCE.same and is_home
+    passed = len(silent) == len(bench.motors) and is_back and moved <= ACCEPTANCE.same and is_home
     sentence = (
-        f"{len(silent)} motors were silent while their supply was off, must be {len(bench.motors)}; the hanging arm "
+        f"{len(silent)} motors were silent while their supply was off, must be {len(bench.motors)}"
+        f"{'' if is_back else ', and not all of them reply again'}; the hanging arm "
         f"turned by {math.degrees(moved):.1f} degrees at most, must be within {math.degrees(ACCEPTANCE.same):g}; it is "
         f"{'near' if is_home else 'not near'} {'home' if any(limits.home) else 'zero'}"
     )

@@ -269,19 +269,6 @@ class Shares(NamedTuple):
     joints: Share  #: (m,)
 
 
-class RunningShare:
-    """The share of the last `window` s, from one estimate to the next: an older one weighs exponentially less."""
-
-    def __init__(self) -> None:
-        self._means: np.ndarray | float = 0.0  # (4, m) Nm^2, see `_products`
-
-    def update(self, dt: float, estimate: WearerEstimate) -> Shares:
-        """Take an estimate, `dt` s after the last; return the shares."""
-        products = _products(*(np.array(column) for column in estimate))
-        self._means = self._means + dt / (SHARE.window + dt) * (products - self._means)
-        return _shares(self._means, 1.0)
-
-
 def observed(
     settings: Settings,
     time: np.ndarray,
@@ -454,7 +441,8 @@ class SupportAdaptation:
         self.requested: float | None = None
         self.problem = ""
         self.shares: Shares | None = None
-        self._running = RunningShare()
+        # (4, m) Nm^2, see `_products`, of the last SHARE.window s: an older estimate weighs exponentially less
+        self._means: np.ndarray | float = 0.0
         self._time = self._due = -math.inf  # s
         self._theta: Sequence[float] | None = None
         self._speed = 0.0  # rad/s, upwards
@@ -466,19 +454,23 @@ class SupportAdaptation:
         joints: Sequence[Sequence[float]] | None,
         estimate: WearerEstimate | None,
         settings: Settings,
+        is_carried: bool = True,
     ) -> None:
         """Take an estimate at `now` s.
 
         joints: angles (n,) rad and velocities (n,) rad/s, None if they are not known.
         estimate: None if there is none.
         settings: the compensator's parameters.
+        is_carried: whether the motors carry the arm: one that is let down sinks, too.
         """
         dt, self._time = now - self._time, now
         is_running = 0.0 < dt <= OBSERVER.max_gap
         if is_running and joints and estimate:
-            self.shares = self._running.update(dt, estimate)
+            products = _products(*(np.array(column) for column in estimate))
+            self._means = self._means + dt / (SHARE.window + dt) * (products - self._means)
+            self.shares = _shares(self._means, 1.0)
         else:
-            self._running, self.shares = RunningShare(), None
+            self._means, self.shares = 0.0, None
             self._theta, self._speed = None, 0.0
         if not settings.is_adaptive or dt > REQUEST.expires:
             self.requested = None
@@ -490,10 +482,11 @@ class SupportAdaptation:
             self.support, self.problem = in_force, ""
             return
         sunk = 0.0
-        if joints and estimate:
+        if joints and estimate and is_carried:
             sunk = self._sunk(dt, joints, estimate.weight, 1.0 - in_force)
         else:
-            self.problem = "the wearer's torque is not known"
+            self._theta, self._speed = None, 0.0
+            self.problem = "the wearer's torque is not known" if is_carried else "the arm is not carried"
         rise = ADAPTATION.rise
         fall = rise if self.problem else (self.support - settings.support) / ADAPTATION.memory
         self.support = max(settings.support, min(1.0, self.support + dt * (rise * sunk - fall)))
@@ -586,19 +579,24 @@ class WearerWatch:
             self._observer = MomentumObserver(settings)
 
     def update(
-        self, now: float, joints: Sequence[Sequence[float]] | None, trunk: tuple[Tilt, Floats3, Tilt] | None
+        self,
+        now: float,
+        joints: Sequence[Sequence[float]] | None,
+        trunk: tuple[Tilt, Floats3, Tilt] | None,
+        is_carried: bool = True,
     ) -> WearerEstimate | None:
         """Process the sample taken at `now` s; return the estimate, or None if there is none.
 
         joints: angles rad, velocities rad/s and the motors' efforts Nm, (n,) each; None if one is missing.
         trunk: tilt of what it feels as gravity, its angular velocity (3,) rad/s in the arm's base frame, and tilt of
         gravity alone; None if it is not known.
+        is_carried: as for `SupportAdaptation.update`.
         """
         self._time, self._estimate = now, None
         if joints is not None and trunk is not None:
             self._estimate = self._observer.update(now, joints, *trunk)
             self._contact.update(now, self._estimate)
-        self.adaptation.update(now, joints and joints[:2], self._estimate, self._settings)
+        self.adaptation.update(now, joints and joints[:2], self._estimate, self._settings, is_carried)
         return self._estimate
 
     def values(self, now: float) -> dict[str, str]:

@@ -300,19 +300,15 @@ class Weigher:
         """Begin a weighing with joint states at `rate` Hz; return why it does not begin, false if it does."""
         control, last = self._control, self.weighing
         self._refusal = refusal(control.settings, control.terms.active, rate)
-        if not self._refusal and last and not last.is_over:
+        is_alike = last and replace(last.settings, payload=control.settings.payload) == control.settings
+        weighing = Weighing(control.settings, self._names, rate, last.empty if last and is_alike else None)
+        if self._refusal:
+            return self._refusal
+        if last and not last.is_over:
             self._refusal = Reason(WeighingRefused.UNDER_WAY, "a weighing is under way")
-        weighing = Weighing(
-            control.settings,
-            self._names,
-            rate,
-            last.empty
-            if last and replace(last.settings, payload=control.settings.payload) == control.settings
-            else None,
-        )
-        if not self._refusal and not control.lend(weighing):
+        elif not control.lend(weighing):
             self._refusal = Reason(WeighingRefused.CHANGING_LOAD, "the load is changing: wait for it")
-        if not self._refusal:
+        else:
             self.weighing, self._count = weighing, self._count + 1
         return self._refusal
 

@@ -155,7 +155,7 @@ class ViewedArm:
         """Take the parameters of compensator and bridge, {} while they are not known."""
         if parameters == self._parameters or not all(parameters):
             return
-        self._parameters = parameters
+        self._parameters, self.description = parameters, None
         try:
             with suppress(KeyError):  # one of them is of another kind of arm
                 self.description = described(*parameters)

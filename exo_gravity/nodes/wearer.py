@@ -17,6 +17,7 @@ import threading
 import time
 from collections.abc import Sequence
 from contextlib import suppress
+from itertools import chain
 from typing import Any
 
 from rcl_interfaces.msg import ParameterEvent
@@ -30,6 +31,7 @@ from exo_gravity.core.arm.tilt import Tilt, turning_in_base
 from exo_gravity.core.compensation.settings import Settings, settings_of
 from exo_gravity.core.compensation.support import NAME, TOPIC
 from exo_gravity.core.errors import ParameterError
+from exo_gravity.core.safety.command import State
 from exo_gravity.core.trunk.inputs import FELT, TiltInput
 from exo_gravity.core.vocabulary import NO_REASON, NONE, UNKNOWN, Reason
 from exo_gravity.hardware.urdf_arm import UrdfArm, arm_from, read_urdf
@@ -51,6 +53,7 @@ SILENCE = 0.5  # s without joint states, after which they are waited for
 # s without the compensator's diagnostics, which come twice a second: the middleware lists a killed node for 20 s
 COMPENSATOR_SILENCE = 2.0
 FRESH = 0.1  # s, age of the trunk's motion that is used
+MOST = 1e3  # rad, rad/s and Nm: no joint reports more, and the observer would take minutes to forget it
 BRIDGE_PARAMETERS = {
     "motor", "torque_scale", "torque_scale_slope", "torque_scale_temperature", "position_min", "position_max",
 }  # fmt: skip
@@ -133,6 +136,7 @@ class WearerNode(Node):
         name = f"{self.get_namespace().rstrip('/')}/{COMPENSATOR}"
         self._compensator = NodeParameters(self, name, self._on_parameters, fitting=fitting)
         self._status_name = name.lstrip("/")
+        self._bridge_name = f"{self.get_namespace().strip('/')}/can_bridge".lstrip("/")
         self._answers = 0  # of the compensator, since its start
         self._statuses = Statuses(self)
         self.create_subscription(ParameterEvent, "/parameter_events", self._on_parameter_event, 50)
@@ -207,7 +211,8 @@ class WearerNode(Node):
         topic = "joint_states"
         if values.get("command_interface") == "multi_array":
             topic = values["multi_array.joint_states"]
-        fixed = (values["joint_names"], settings.side, settings.use_imu, topic)
+        urdf = (values.get(f"urdf.{part}") for part in ("file", "topic", "hand"))
+        fixed = (values["joint_names"], settings.side, settings.use_imu, topic, *urdf)
         if self._watch is None:
             self._fixed, self._names = fixed, values["joint_names"]
             self._joint_states = PolledSubscription(self, JointState, topic, self._on_joint_state)
@@ -216,7 +221,7 @@ class WearerNode(Node):
         if fixed != self._fixed:
             self._refusal = Reason(
                 NoEstimate.REFUSED_PARAMETERS,
-                "the compensator has other joints or another trunk than before: restart this node",
+                "the compensator has another arm or another trunk than before: restart this node",
             )
             return
         with self._lock:
@@ -259,7 +264,7 @@ class WearerNode(Node):
     def _estimate(self) -> None:
         """Publish the estimate from the newest joint state, if it is new."""
         settings, watch = self._settings, self._watch
-        if not settings or not watch or not self._joint_states or self._silence():
+        if not settings or not watch or not self._joint_states or self._missing:
             return
         self._joint_states.poll()
         taken, message = self._newest
@@ -268,8 +273,10 @@ class WearerNode(Node):
         self._last = taken
         upright = Tilt.of(settings.side)
         joints, trunk = self._joints(message), self._trunk.at(taken) if self._trunk else (upright, ZERO, upright)
+        # An arm of ros2_control has no bridge that says what it does.
+        bridge = self._statuses.within(COMPENSATOR_SILENCE, self._bridge_name)
         with self._lock:
-            estimate = watch.update(taken, joints, trunk)
+            estimate = watch.update(taken, joints, trunk, bridge.get("state", State.ACTIVE) == State.ACTIVE)
         self._problem = NO_REASON
         if estimate:
             for publisher, values in ((self._efforts, estimate.torque), (self._deviations, estimate.deviation)):
@@ -281,18 +288,19 @@ class WearerNode(Node):
         else:
             self._problem = Reason(
                 NoEstimate.INCOMPLETE_JOINT_STATES,
-                "joint_states have no positions, velocities and efforts of these joints",
+                "joint_states have no possible positions, velocities and efforts of these joints",
             )
         self._ask_for_support()
 
     def _joints(self, message: JointState) -> list[tuple[float, ...]] | None:
-        """Return positions, velocities and efforts (n,); None if one is missing."""
+        """Return positions, velocities and efforts (n,); None if one is missing, or beyond MOST."""
         try:
             if self._urdf:
                 self._urdf.follow(message.name, message.position)
-            return [by_name(message, field, self._names, exact=False) for field in ("position", "velocity", "effort")]
+            parts = [by_name(message, field, self._names, exact=False) for field in ("position", "velocity", "effort")]
         except ParameterError:
             return None
+        return parts if max(map(abs, chain(*parts))) <= MOST else None
 
     def _ask_for_support(self) -> None:
         """Renew the request, or change it at once."""
@@ -304,17 +312,16 @@ class WearerNode(Node):
         request.header.stamp = self.get_clock().now().to_msg()
         self._requests.publish(request)
 
-    def _silence(self) -> Reason:
-        """Return who is silent, false if the compensator is not."""
-        return (
-            NO_REASON
-            if self._statuses.within(COMPENSATOR_SILENCE, self._status_name)
-            else Reason(NoEstimate.NO_COMPENSATOR, f"waiting for {self._status_name}")
-        )
+    @property
+    def _missing(self) -> Reason:
+        """What is missing of the compensator, false if nothing is."""
+        if self._statuses.within(COMPENSATOR_SILENCE, self._status_name):
+            return self._refusal
+        return Reason(NoEstimate.NO_COMPENSATOR, f"waiting for {self._status_name}")
 
     def _why_not(self, now: float) -> tuple[bytes, WearerState, Reason]:
         """Return level, state, and why nothing is estimated."""
-        problem = self._silence() or self._refusal
+        problem = self._missing
         if not problem and now - self._last > SILENCE:
             problem = Reason(NoEstimate.NO_JOINT_STATES, "waiting for joint_states")
             if math.isfinite(self._last):
@@ -327,7 +334,7 @@ class WearerNode(Node):
         level, state, why_not = self._why_not(now)
         values: dict[str, object] = {"state": state, "reason": why_not.word, "budget": budget.result.word}
         values |= {"budget text": budget.result, "largest support": budget.largest_support}
-        if self._watch and not (self._silence() or self._refusal):
+        if self._watch and not self._missing:
             with self._lock:
                 values |= self._watch.values(now)
         else:

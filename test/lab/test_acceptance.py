@@ -2,7 +2,7 @@
 """The bench acceptance, run on the simulated device in virtual time, where its motors can be set up wrongly."""
 
 import json
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from unittest.mock import Mock
 
@@ -24,16 +24,15 @@ NAMES = [step.__name__ for step in STEPS]
 
 
 class Person:
-    """Does what is asked; the loop runs meanwhile."""
+    """Does what is asked; the loop runs meanwhile. supply: whether it is on, in turn, when they are to switch it."""
 
-    def __init__(self, forgets: bool) -> None:
+    def __init__(self, supply: Sequence[bool]) -> None:
         self.arm: VirtualArm | None = None
         self.said: list[str] = []
-        self.forgets = forgets
+        self.supply = supply
 
     def ask(self, request: str, watch: Callable[[], str]) -> None:
-        is_switched = "switch the motors' supply off and on" in request and not self.forgets
-        for on in (False, True) if is_switched else (True,):
+        for on in self.supply if "switch the motors' supply off and on" in request else (True,):
             for motor in self.arm.device.motors:
                 motor.unplugged = not on
             for _ in range(20):
@@ -44,14 +43,14 @@ class Person:
 def acceptance(
     name: str = "sim",
     weight: Weight = WEIGHT,
-    forgets: bool = False,
+    supply: Sequence[bool] = (False, True),
     cold: float = 25.0,
     assumed_timeout: float | None = None,
     **simulator: object,
 ) -> list[BenchStep]:
     """Run the acceptance of an arm of config, whose device carries the weight from the beginning.
 
-    forgets: whether the person forgets the supply. cold: temperature of the first motor, degC. assumed_timeout: of the
+    supply: as for `Person`. cold: temperature of the first motor, degC. assumed_timeout: of the
     last motor, as the file has it, s. simulator: parameters of the device.
     """
     params = packaged_config(f"{name}.yaml")
@@ -65,7 +64,7 @@ def acceptance(
     device.motors[0].temperature = cold
     last = arm.motors[-1]
     motors = (*arm.motors[:-1], last if assumed_timeout is None else replace(last, timeout=assumed_timeout))
-    person, rate = Person(forgets), arm.can_bridge["rate"]
+    person, rate = Person(supply), arm.can_bridge["rate"]
     lift = Lift(arm.limits, 1.0 / rate)
     person.arm = played = VirtualArm(device, lift, motors, arm.limits, rate)
     bench = Bench(played.loop, motors, model_of(arm), weight, played.run, person.ask)
@@ -95,7 +94,8 @@ def test_a_device_as_its_file_says_passes_every_step_and_leaves_a_record():
 
 CASES = {  # what is the case, the step that fails, and what is said
     "a cold motor without the offset of its temperature": ({"cold": -15.0}, "cold", ""),
-    "a supply that was not switched": ({"forgets": True}, "zero", ""),
+    "a supply that was not switched": ({"supply": (True,)}, "zero", ""),
+    "a supply that stays off": ({"supply": (False,)}, "zero", "not all of them reply again"),
     "a weight that the last joint of an arm from a URDF hardly feels": (
         {"name": "three_joints", "weight": Weight(0.05, 0.02)},
         "torque",
@@ -108,7 +108,7 @@ CASES = {  # what is the case, the step that fails, and what is said
 }
 
 
-@pytest.mark.parametrize("case", quick(list(CASES)[:3], CASES))
+@pytest.mark.parametrize("case", quick(list(CASES)[:4], CASES))
 def test_what_is_not_as_the_file_says_fails_at_its_step(case):
     given, step, said = CASES[case]
     results = acceptance(**given)

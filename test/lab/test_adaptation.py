@@ -22,7 +22,7 @@ class Arm:
     def __init__(self, **settings: Any) -> None:
         self.settings = replace(SETTINGS, **settings)
         self.adaptation = SupportAdaptation()
-        self.share, self.deviation = 0.4, 0.3  # and Nm
+        self.share, self.deviation, self.is_carried = 0.4, 0.3, True  # and Nm
         self.now, self.angle = 0.0, 1.0
         self.changes: list[float] = []
 
@@ -35,7 +35,7 @@ class Arm:
             self.angle += speed * PERIOD
             joints = (0.0, round(self.angle / CODE) * CODE, 0.0, 0.0), (0.0, speed, 0.0, 0.0)
             before = self.adaptation.requested
-            self.adaptation.update(self.now, joints, estimate if is_known else None, self.settings)
+            self.adaptation.update(self.now, joints, estimate if is_known else None, self.settings, self.is_carried)
             if before is not None and self.adaptation.requested != before:
                 self.changes.append(self.now)
         return self.adaptation.support
@@ -74,8 +74,11 @@ def test_a_raised_support_is_forgotten_while_held_and_lifting_takes_it_back_half
 
 @pytest.mark.parametrize(
     ("what", "speed"),
-    [({}, -0.3), ({"share": -0.3}, -0.05), ({"share": 1.3}, -0.05), ({"deviation": 1.5}, -0.05)],
-    ids=["a movement", "pressed down", "motors off", "too wide a band"],
+    [
+        ({}, -0.3),
+        *((what, -0.05) for what in ({"share": -0.3}, {"share": 1.3}, {"deviation": 1.5}, {"is_carried": False})),
+    ],
+    ids=["a movement", "pressed down", "motors off", "too wide a band", "let down"],
 )
 def test_what_is_no_sign_of_tiring_raises_nothing(what: dict[str, float], speed: float) -> None:
     arm = Arm()

@@ -19,7 +19,7 @@ from exo_gravity.lab.observer import (
     PERIOD,
     ContactWatch,
     MomentumObserver,
-    RunningShare,
+    SupportAdaptation,
     WearerCurve,
     WearerEstimate,
     WearerWatch,
@@ -229,9 +229,10 @@ def test_an_error_of_the_weight_is_the_same_share_in_every_joint_and_does_not_av
     light = light._replace(deviation=0.12 * np.abs(light.weight))
     assert share_of(light).deviation == pytest.approx(0.12)
     assert joint_shares(light).deviation[1:] == pytest.approx(0.12)
-    watch, joints = RunningShare(), (light.torque[-1], light.deviation[-1], light.weight[-1], light.independent[-1])
-    for _ in range(500):
-        shares = watch.update(PERIOD, WearerEstimate(*map(tuple, joints)))
+    running, estimate = SupportAdaptation(), WearerEstimate(*(tuple(column[-1]) for column in light[1:]))
+    for n in range(500):
+        running.update(n * PERIOD, (POSE, STILL), estimate, SETTINGS)
+    shares = running.shares
     assert shares.whole == pytest.approx((0.1, 0.12)) and np.array(shares.joints)[:, 1] == pytest.approx((0.1, 0.12))
 
 

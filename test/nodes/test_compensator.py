@@ -541,7 +541,9 @@ def test_what_the_motors_do_not_carry_is_published_as_the_wearers_and_follows_th
     rig.wait_until(lambda: rig.torques == [f"{torque:.1f}" for torque in GIVEN])
     share = f"{100.0 * (GIVEN @ WEIGHT) / (WEIGHT @ WEIGHT):.0f}"
     rig.wait_until(lambda: rig.found("share of the wearer (%)") == share)
-    rig.effort = NEEDED.tolist()
+    rig.velocity = [1e200] * len(NAMES)  # it would end the node, and 1e150 would be remembered for minutes
+    rig.wait_until(lambda: rig.found("reason") == "incomplete_joint_states")
+    rig.velocity, rig.effort = STILL, NEEDED.tolist()
     rig.wait_until(lambda: rig.torques == NONE and rig.found("share of the wearer (%)") == "0")
     assert (rig.found("contacts"), rig.found("contact joint")) == ("0", "none")
 
@@ -617,6 +619,14 @@ def test_the_support_follows_an_arm_that_sinks_and_returns_when_the_node_ends_wh
     assert rig.set(model_error__wearer=0.3) == [""]
     rig.wait_until(lambda: asked() == 0.4 and rig.found("support adapts") == "held")
     assert rig.set(model_error__wearer=0.03) == [""]
+    state = DiagnosticStatus(name="right/can_bridge", values=[KeyValue(key="state", value="letting down")])
+    bridge = rig.user.create_publisher(DiagnosticArray, "/diagnostics", 10)
+    rig.wait_until(
+        lambda: (
+            bridge.publish(DiagnosticArray(status=[state]))
+            or rig.found("support adapts text") == "the arm is not carried"
+        )
+    )
     sinking[0] = 0.0004
     rig.wait_until(lambda: in_use() > 0.42)
     rig.wearer.close()
@@ -657,3 +667,6 @@ def test_a_joint_that_is_not_listed_is_at_0_for_compensator_wearer_and_tools(alo
     watch = BudgetWatch(alone.wearer)
     alone.wait_until(lambda: watch.update(listed, of_tools.settings) or watch.result.word != Budget.UNKNOWN)
     assert watch.result.word == Budget.WITHIN_RATED
+    for hand in ("", "hand"):  # of another arm than that which is estimated
+        alone.wearer._on_parameters("", {**values, "urdf.hand": hand})
+    assert alone.wearer._refusal.word == "refused_parameters"

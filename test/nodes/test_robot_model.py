@@ -44,7 +44,7 @@ class Viewer(NodeRig):
 
     def __init__(self) -> None:
         super().__init__()
-        self.add(RobotModel())
+        self.model = self.add(RobotModel())
         for name, given in load(BOTH).items():
             side, _, leaf = name[1:].partition("/")
             table = {"compensator": COMPENSATOR, "can_bridge": CAN_BRIDGE}.get(leaf)
@@ -120,6 +120,9 @@ def test_a_viewer_gets_the_description_the_joint_states_of_both_arms_and_markers
     viewer.wait_until(lambda: list(viewer.states.name) == names("right"))
     viewer.wait_until(lambda: not any(group.startswith("left") for group, _ in viewer.markers))
     viewer.wait_until(lambda: viewer.statuses["robot_model"].message == "no messages on /left/joint_states")
+    arm = viewer.model._arms["/right"]
+    arm.describe({**arm._parameters[0], "link_length": [-1.0] * 4}, arm._parameters[1])  # by a restart
+    assert arm.view({}) is None and "length" in arm.problem  # the last description is not shown on
 
 
 # The layouts of RViz, PlotJuggler and Foxglove, and the launch file: what they name exists. The viewers have no wheels
