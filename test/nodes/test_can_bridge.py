@@ -53,6 +53,7 @@ from exo_gravity.nodes.can_bridge.operation import (
     Operator,
 )
 from exo_gravity.nodes.compensator.arm import JointStateInterface
+from exo_gravity.nodes.ros import inner
 from exo_gravity.nodes.ros.inner import NodeExecutor
 from exo_gravity.nodes.ros.messages import OK, WARN, Diagnostics
 from exo_gravity.nodes.ros.subscriptions import MANY_REQUESTS
@@ -247,8 +248,8 @@ def test_the_answer_to_a_request_has_a_word_of_its_own_for_each_reason(ask, monk
         assert said in ask(service, loop) and ask.last == (service, word)
     assert not waiting.set_running_or_notify_cancel()  # as the control thread asks: nothing happens later
     loop.call = run
-    monkeypatch.setattr(operation, "age_of_request", lambda node: 1.5)
-    assert "1.5 s old" in ask("enable", loop, True) and ask.last == ("enable", "too_old")
+    monkeypatch.setattr(inner, "REQUEST_LIFE", -1.0)
+    assert "0.0 s old" in ask("enable", loop, True) and ask.last == ("enable", "too_old")
     assert ask("enable", loop, False) == ""
 
 
@@ -287,7 +288,7 @@ def test_simulated_time_is_refused_with_a_real_bus_at_the_start_and_live(node):
 
 @pytest.mark.parametrize("data", [True, False])
 def test_an_enable_that_has_waited_is_refused_and_a_let_down_is_not(served, monkeypatch, data):
-    monkeypatch.setattr(operation, "REQUEST_LIFE", 0.2)
+    monkeypatch.setattr(inner, "REQUEST_LIFE", 0.2)
     loop = standing()
     loop.safety.enable(1.0)
     if data:
@@ -301,7 +302,7 @@ def test_an_enable_that_has_waited_is_refused_and_a_let_down_is_not(served, monk
 
 
 def test_a_let_down_is_not_pushed_out_by_a_hundred_other_requests(served, monkeypatch):
-    monkeypatch.setattr(operation, "REQUEST_LIFE", 0.0)  # those are refused
+    monkeypatch.setattr(inner, "REQUEST_LIFE", 0.0)  # those are refused
     loop = standing()
     loop.safety.enable(1.0)
     services = BridgeServices(served.node, lambda: loop, (), lambda: "")

@@ -41,6 +41,7 @@ from exo_gravity.lab.inputs.arms import read_arm
 from exo_gravity.lab.vocabulary import Budget
 from exo_gravity.nodes.compensator import arm
 from exo_gravity.nodes.compensator.node import CompensatorNode
+from exo_gravity.nodes.ros import inner
 from exo_gravity.nodes.ros.inner import NodeExecutor
 from exo_gravity.nodes.ros.messages import to_nanoseconds
 from exo_gravity.nodes.ros.subscriptions import LATCHED
@@ -350,7 +351,7 @@ ADAPTIVE = {**WORN, "mode": "zero_g", "support": 0.4, "support_adapts": "true", 
 
 
 @pytest.mark.thorough
-def test_a_load_is_weighed_on_request_and_one_that_is_dropped_is_no_longer_a_parameter(make_rig):
+def test_a_load_is_weighed_on_request_and_one_that_is_dropped_is_no_longer_a_parameter(make_rig, monkeypatch):
     rig = make_rig("/right", {**WORN, "support": 0.5}, NAMES, POSE).start()
 
     def weigh() -> Trigger.Response:
@@ -360,6 +361,9 @@ def test_a_load_is_weighed_on_request_and_one_that_is_dropped_is_no_longer_a_par
     refused = weigh()
     assert not refused.success and "support 1" in refused.message
     rig.wait_for({"weigh refused": "support", "weighing number": "0"})
+    with monkeypatch.context() as slow_network:
+        slow_network.setattr(inner, "REQUEST_LIFE", -1.0)
+        assert "s old" in weigh().message
     assert rig.set(mode="zero_g", support=1.0) == ["", ""]
     rig.wait_until(lambda: rig.values["changing load"] == "none" and weigh().success)
     rig.wait_for({"weighing": "taking_over", "weighing number": "1"})

@@ -39,7 +39,7 @@ from exo_gravity.hardware.network import restrict_to_localhost
 from exo_gravity.hardware.owned_bus import OwnedBus, Watchdog, take_over
 from exo_gravity.nodes.can_bridge import operation
 from exo_gravity.nodes.can_bridge.effort_exchange import Answer, EffortExchange
-from exo_gravity.nodes.ros.inner import Until, age_of_request, prepare_transitions
+from exo_gravity.nodes.ros.inner import Until, prepare_transitions, why_too_old
 from exo_gravity.nodes.ros.parameters import bus_of, declare
 from exo_gravity.nodes.ros.run import run
 from exo_gravity.nodes.ros.subscriptions import TiltSubscription
@@ -188,7 +188,7 @@ class CanBridge(LifecycleNode):
         if self._is_leaving:
             return LEAVING
         if transition in ARMING:
-            return operation.why_too_old(age_of_request(self))
+            return why_too_old(self)
         if loop is None or loop.is_off or transition not in (*DEACTIVATE, *SHUTDOWN):
             return ""
         self._is_leaving = True

@@ -40,7 +40,7 @@ from exo_gravity.hardware.can_port import ArmOnBus, serial_of
 from exo_gravity.hardware.clock import COMPUTER_CLOCK, Clock
 from exo_gravity.hardware.control_loop import ControlLoop
 from exo_gravity.hardware.network import open_to_others
-from exo_gravity.nodes.ros.inner import Until, age_of_request, wake
+from exo_gravity.nodes.ros.inner import Until, wake, why_too_old
 from exo_gravity.nodes.ros.messages import (
     ERROR,
     HELD_BY,
@@ -60,7 +60,6 @@ SLOW = 0.9  # share of the set rate below which the loop is slow
 REQUESTS = 32  # of control, that wait for the next look
 WATCH_PERIOD = 0.1  # s between two looks at them
 CALL_TIMEOUT = 2.0  # s that a service waits for the control thread
-REQUEST_LIFE = 1.0  # s; a busy computer delays requests by tenths of that
 
 # What follows a request that was carried out, by the state that it led to.
 FOLLOWS = {
@@ -84,16 +83,6 @@ def refuse_simulated_time(node: Node, interface: str) -> None:
         raise ParameterError("use_sim_time", True, f"false {why}")
     fixed = ParameterDescriptor(type=ParameterType.PARAMETER_BOOL, description=f"always false {why}", read_only=True)
     node.set_descriptor("use_sim_time", fixed)
-
-
-def why_too_old(age: float) -> str:
-    """Return why a request that is `age` s old may not arm an arm; '' if it may."""
-    if age <= REQUEST_LIFE:
-        return ""
-    return (
-        f"refused: the request is {age:.1f} s old, must be at most {REQUEST_LIFE:g} s: send it again; if it comes from "
-        "another computer, compare the clocks"
-    )
 
 
 class BridgeServices:
@@ -184,7 +173,7 @@ class BridgeServices:
         if lets_down:
             for waiting in tuple(self._arming):
                 waiting.cancel()
-        elif too_old := why_too_old(age_of_request(self._node)):
+        elif too_old := why_too_old(self._node):
             return Reason(Answer.TOO_OLD, too_old)
         elif refusal := self._refusal():
             return Reason(Answer.LEAVING, refusal)

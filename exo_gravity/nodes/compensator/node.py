@@ -38,6 +38,7 @@ from exo_gravity.nodes.compensator.arm import (
     sentence,
     warnings_of,
 )
+from exo_gravity.nodes.ros.inner import why_too_old
 from exo_gravity.nodes.ros.messages import ERROR, OK, STALE, WARN, Diagnostics, milliseconds, row, to_nanoseconds
 from exo_gravity.nodes.ros.parameters import accept_changes
 from exo_gravity.nodes.ros.run import run
@@ -223,7 +224,7 @@ class CompensatorNode(Node):
 
     def _begin(self, client: Any, _request: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
         with self._lock:
-            problem = client.begin(self._rate.value)
+            problem = why_too_old(self) or client.begin(self._rate.value)
         response.success, response.message = not problem, str(problem) or client.help
         return response
 

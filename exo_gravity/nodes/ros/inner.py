@@ -24,6 +24,7 @@ from rclpy.service import Service
 
 STOOD_STILL = 1.0  # s between two looks at what is due, after which an executor has stood still
 QUEUED_TIME = 0.5  # s after that in which requests may have been queued meanwhile
+REQUEST_LIFE = 1.0  # s; a busy computer delays requests by tenths of that
 PACKAGE = __name__.partition(".")[0]
 
 
@@ -100,9 +101,18 @@ class NodeExecutor(SingleThreadedExecutor):
         return answer
 
 
-def age_of_request(node: Node) -> float:
-    """Return how old the request is that `node` is answering, in s; 0 if its executor does not know."""
-    return float(getattr(node.executor, "request_age", 0.0))
+def why_too_old(node: Node) -> str:
+    """Return why the request that `node` is answering is too old to move an arm, '' if it may: also if that is not known.
+
+    Whoever sent it no longer expects it to be carried out.
+    """
+    age = getattr(node.executor, "request_age", 0.0)
+    if age <= REQUEST_LIFE:
+        return ""
+    return (
+        f"refused: the request is {age:.1f} s old, must be at most {REQUEST_LIFE:g} s: send it again; if it comes from "
+        "another computer, compare the clocks"
+    )
 
 
 def wake(node: Node) -> None:
