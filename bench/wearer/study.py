@@ -25,7 +25,7 @@ from exo_gravity.core.compensation.settings import Settings
 from exo_gravity.core.errors import DataError
 from exo_gravity.core.numbers import NO_TORQUE, Torque
 from exo_gravity.core.safety.limits import Limits
-from exo_gravity.lab.observer import Share, WearerCurve, observed, share_of
+from exo_gravity.lab.observer import Share, WearerCurve, observed, shares_of
 from exo_gravity.lab.trial.offline import ArmSetup, OfflineTrial
 from exo_gravity.sim import STEP, SimulatedImu, VirtualWearer
 from exo_gravity.sim.device import path_between
@@ -243,10 +243,13 @@ def play(worn: Worn) -> Trial:
     kind = np.array([_kind(phases[n], passed) for n, passed in at])
     kind[_trunk_moves(since)] = KINDS.index("trunk in motion")
     part = np.searchsorted((3, 5), [n for n, _ in at], side="right")
-    parts = tuple((share_of(only(curve, part == n)), float(share_of(only(truth, part == n)).value)) for n in range(3))
-    true_share = float(share_of(truth).value)
+    parts = tuple(
+        (shares_of(only(curve, part == n)).whole, float(shares_of(only(truth, part == n)).whole.value))
+        for n in range(3)
+    )
+    true_share = float(shares_of(truth).whole.value)
     error = curve.torque - truth.torque
-    return Trial(error, curve.deviation, kind, share_of(curve), true_share, parts, trial.trouble)
+    return Trial(error, curve.deviation, kind, shares_of(curve).whole, true_share, parts, trial.trouble)
 
 
 def _kind(phase: Phase, since: float) -> int:

@@ -181,9 +181,11 @@ class Projection:
 
 
 def train(
-    inputs: np.ndarray, output: np.ndarray, functions: int = 4, ridge: float = RIDGE, max_evaluations: int | None = None
+    inputs: np.ndarray, output: np.ndarray, functions: int = 4, ridge: float = RIDGE, most: int = MAX_EVALUATIONS
 ) -> Trained:
     """Return an ANFIS of `functions` Gaussians per input, trained on inputs (n, d) in -1..1 and output (n,).
+
+    most: evaluations of the premises.
 
     Raises DataError if there are fewer samples than consequents.
     """
@@ -198,7 +200,6 @@ def train(
     centre = np.tile(np.linspace(-1.0, 1.0, functions), dimension)
     start = np.concatenate((centre, np.full(count, np.log(1.05 * NARROWEST))))
     problem = Projection(inputs, output, functions, ridge)
-    most = max_evaluations or MAX_EVALUATIONS
     found = least_squares(problem.residual, start, problem.jacobian, (low, high), max_nfev=most, ftol=1e-4, xtol=1e-8)
     model = problem.model(found.x)
     return Trained(model, float(rms(model.output(inputs)[:, 0] - output)), found.nfev, time.perf_counter() - started)

@@ -124,7 +124,7 @@ class PolledChip(ImuSource):
         if -2.0 < behind < -POLLING.early:  # further ahead: the clock was set back
             return []
         if 1.0 <= behind < math.inf:
-            self._lose(int(behind), "read too late")
+            self.lost, self.loss = self.lost + int(behind), "read too late"
         self._due = self._period + (self._due if abs(behind) < 1.0 else now)
         try:
             values = self._chip.gyro, self._chip.acceleration
@@ -136,16 +136,13 @@ class PolledChip(ImuSource):
             if self._has_failed:
                 raise DeviceError(self.name, f"does not answer: {error.strerror or error}") from None
             self._has_failed = True
-            self._lose(1, "a transfer failed")
+            self.lost, self.loss = self.lost + 1, "a transfer failed"
             return []
         self._has_failed = False
         if values == self._last:  # it has not measured since
             return []
         self._last = values
         return [ImuSample(taken, *values)]
-
-    def _lose(self, count: int, why: str) -> None:
-        self.lost, self.loss = self.lost + count, why
 
     def close(self) -> None:
         """Close the bus; never raises."""

@@ -297,19 +297,14 @@ def while_between(curve: WearerCurve, spans: Iterable[tuple[float, float]]) -> W
     return WearerCurve(*(part[keep] for part in curve))
 
 
-def share_of(curve: WearerCurve, window: float = math.inf) -> Share:
-    """Return the wearer's share over the last `window` s at each time, or one number over the whole curve."""
+def shares_of(curve: WearerCurve, window: float = math.inf) -> Shares:
+    """Return the wearer's shares over the last `window` s at each time, or over the whole curve."""
     products = _products(*curve[1:])
     if math.isinf(window):
-        return _shares(products.sum(axis=1), len(curve.time)).whole
+        return _shares(products.sum(axis=1), len(curve.time))
     total = np.pad(products.cumsum(axis=1), ((0, 0), (1, 0), (0, 0)))
     first = np.searchsorted(curve.time, curve.time - window)
-    return _shares(total[:, 1:] - total[:, first], np.arange(len(first)) + 1 - first).whole
-
-
-def joint_shares(curve: WearerCurve) -> Share:
-    """Return the share of each joint (m,) over the whole curve."""
-    return _shares(_products(*curve[1:]).sum(axis=1), len(curve.time)).joints
+    return _shares(total[:, 1:] - total[:, first], np.arange(len(first)) + 1 - first)
 
 
 class WearerPart(NamedTuple):
@@ -355,7 +350,7 @@ def wearer_of(bag: Bag, recording: Recording) -> WearerPart | None:
     curve = while_between(curve, recording.while_carried(-np.inf, np.inf))
     if not len(curve.time):
         return None
-    return WearerPart(curve, share_of(curve, SHARE.window), share_of(curve), joint_shares(curve))
+    return WearerPart(curve, shares_of(curve, SHARE.window).whole, *shares_of(curve))
 
 
 def wearer_sentences(part: WearerPart, source: Source, names: Sequence[str]) -> Iterator[str]:

@@ -8,6 +8,7 @@ the virtual wearer performs.
 import json
 import threading
 from collections import deque
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -26,7 +27,7 @@ from exo_gravity.nodes.ros.imu_messages import message_of
 from exo_gravity.nodes.ros.messages import OK, WARN, Diagnostics
 from exo_gravity.nodes.ros.parameters import accept_changes, bus_of, declare, given_to
 from exo_gravity.nodes.ros.run import run
-from exo_gravity.nodes.ros.subscriptions import LATCHED
+from exo_gravity.nodes.ros.subscriptions import LATCHED, PeriodicThread
 
 with extras("simulator", "sim"):
     from exo_gravity.sim import SimulatedImu, VirtualWearer
@@ -43,8 +44,6 @@ class Simulator(Node):
 
     That thread also publishes, while no motor has a reply to send. Another thread that publishes would hold the
     interpreter's lock when a command arrives, and a late reply looks like a silent motor.
-
-    failure: the exception that ended the thread, or None; `run` then ends the node.
     """
 
     def __init__(self) -> None:
@@ -67,7 +66,6 @@ class Simulator(Node):
         self._trunk_period = 1.0 / self._imu.config.rate
         self._trunk_due = 0.0  # monotonic s
         accept_changes(self, table, lambda values: (values, self._script_of(values["trial"])), self._apply)
-        self.failure: Exception | None = None
         self._stopping = threading.Event()
         (interface, channel, options), count = bus_of(self, values), len(self._device.motors)
         of_bus = {name: own for name, (_, own) in buses_of(channel, options, count).items()}
@@ -77,8 +75,14 @@ class Simulator(Node):
         self._device.is_fd = [is_fd(of_bus[name]) for name in channels]
         names = " and ".join(str(bus.channel_info) for bus in buses.values())
         self.get_logger().info(f"simulated {values['side']} arm on {names}")
-        self._thread = threading.Thread(target=self._play, name="device", daemon=True)
+        play = partial(self._device.run, self._buses, self._stopping.is_set, self._on_idle)
+        self._thread = PeriodicThread("device", play, 0.0)
         self._thread.start()
+
+    @property
+    def failure(self) -> Exception | None:
+        """The exception that ended the thread, or None; `run` then ends the node."""
+        return self._thread.failure
 
     @property
     def needed(self) -> bool:
@@ -88,15 +92,9 @@ class Simulator(Node):
     def close(self) -> None:
         """Stop the device and close its buses."""
         self._stopping.set()
-        self._thread.join()
+        self._thread.stop()
         for bus in set(self._buses):
             bus.shutdown()
-
-    def _play(self) -> None:
-        try:
-            self._device.run(self._buses, self._stopping.is_set, self._on_idle)
-        except Exception as error:
-            self.failure = error
 
     def _script_of(self, path: str) -> TrialScript | None:
         """Return the script in a file for this arm, None if `path` is empty. Raises ParameterError."""

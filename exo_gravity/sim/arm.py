@@ -226,7 +226,9 @@ class ArmConfig(JointConfig):
 
     def felt(self, side: str, state: TrunkState) -> tuple[Floats3, Floats3, Floats3]:
         """Return what the base of the `side` arm feels, in its own axes."""
-        return felt_in_base(side, state, self.links.gravity)
+        felt = self.links.gravity * gravity_in_trunk(state.pitch, state.roll) - state.acceleration
+        spin, spin_up = state.angular_velocity, state.angular_acceleration
+        return in_base(side, felt.tolist()), in_base(side, spin, turning=True), in_base(side, spin_up, turning=True)
 
 
 def in_base(side: str, vector: Sequence[float], turning: bool = False) -> Floats3:
@@ -238,16 +240,6 @@ def in_base(side: str, vector: Sequence[float], turning: bool = False) -> Floats
     if side == "left":
         return y, x, -z
     return (y, -x, z) if turning else (-y, x, -z)
-
-
-def felt_in_base(side: str, state: TrunkState, gravity: float) -> tuple[Floats3, Floats3, Floats3]:
-    """Return what the `side` arm's base feels, each (3,) in its frame, as for `SimulatedArm.move_base`.
-
-    Gravity less acceleration in m/s^2, angular velocity in rad/s, angular acceleration in rad/s^2. gravity: m/s^2.
-    """
-    felt = gravity * gravity_in_trunk(state.pitch, state.roll) - state.acceleration
-    spin, spin_up = state.angular_velocity, state.angular_acceleration
-    return in_base(side, felt.tolist()), in_base(side, spin, turning=True), in_base(side, spin_up, turning=True)
 
 
 class SimulatedArm:

@@ -111,9 +111,7 @@ class Arbitration:
                 failing += [controller for _, controller in kept]
                 self._fail(failing, now)
                 duration = (at + 1 + ERROR_FRAME_BITS) / self._bitrate  # an error frame ends theirs
-                for controller in failing:
-                    controller.suspend(now + duration, self._bitrate)
-                self._clock.later(duration, self._become_idle)
+                self._clock.later(duration, partial(self._finish, (), failing))
                 return
             self._fail(failing, now)
             failed += failing
@@ -134,7 +132,7 @@ class Arbitration:
                 self.bus_offs += 1
 
     def _finish(self, senders: Sequence[CanController], failed: Sequence[CanController]) -> None:
-        """Deliver the frame that `senders` have sent, all the same bits, and whose ID those that failed have too."""
+        """Deliver the frame that `senders` have sent, all the same bits; those that `failed` had the same ID."""
         sent = [controller.pending.popleft() for controller in senders]
         for controller in senders:
             controller.tec = max(0, controller.tec - 1)
@@ -142,12 +140,8 @@ class Arbitration:
             controller.suspend(self._clock.monotonic(), self._bitrate)
         self._is_busy = False
         self._clock.later(0.0, self._begin)
-        sender, message, _ = sent[0]
-        self._deliver(sender, message)
-
-    def _become_idle(self) -> None:
-        self._is_busy = False
-        self._begin()
+        for sender, message, _ in sent[:1]:
+            self._deliver(sender, message)
 
 
 def _arbitration_id(controller: CanController) -> tuple[int, bool, bool]:

@@ -23,13 +23,12 @@ from exo_gravity.lab.observer import (
     WearerCurve,
     WearerEstimate,
     WearerWatch,
-    joint_shares,
     observed,
-    share_of,
+    shares_of,
     while_between,
 )
 from exo_gravity.sim import STEP, ArmConfig, SimulatedArm
-from exo_gravity.sim.arm import DEFAULT_LINKS, felt_in_base
+from exo_gravity.sim.arm import DEFAULT_LINKS
 from exo_gravity.sim.trunk_motion import TrunkState
 
 LOAD = Wearer(75.0).on_links(DEFAULT_LINKS.length)
@@ -92,7 +91,7 @@ def simulated(seconds, torque_of, base=None):
     for n in range(round(seconds / PERIOD)):
         now = n * PERIOD
         state = base(now) if base else TrunkState(TILT.pitch, TILT.roll)
-        gravity, turning, spin_up = felt_in_base("right", state, DEFAULT_LINKS.gravity)
+        gravity, turning, spin_up = arm.config.felt("right", state)
         arm.move_base(gravity, turning, spin_up)
         tilt = TILT._replace(direction=tuple(np.divide(gravity, np.linalg.norm(gravity))))
         tilt = tilt._replace(magnitude=float(np.linalg.norm(gravity)) / DEFAULT_LINKS.gravity)
@@ -201,15 +200,17 @@ def curve(share, count=500, deviation=0.1):
 
 
 def test_the_share_is_that_of_the_weight_that_the_wearer_gives_and_a_longer_time_does_not_narrow_its_band():
-    assert share_of(curve(0.35)).value == pytest.approx(0.35)
-    sliding = share_of(curve(np.repeat((0.2, 0.8), 250)), 1.0).value  # which forgets
+    assert shares_of(curve(0.35)).whole.value == pytest.approx(0.35)
+    sliding = shares_of(curve(np.repeat((0.2, 0.8), 250)), 1.0).whole.value  # which forgets
     assert sliding[249] == pytest.approx(0.2) and 0.2 < sliding[300] < 0.8
     assert sliding[-1] == pytest.approx(0.8)
-    short, long = (share_of(curve(0.5, count)).deviation for count in (100, 2000))
+    short, long = (shares_of(curve(0.5, count)).whole.deviation for count in (100, 2000))
     assert long == pytest.approx(short, rel=0.3)
-    assert share_of(curve(0.5, deviation=0.2)).deviation == pytest.approx(2.0 * share_of(curve(0.5)).deviation)
+    assert shares_of(curve(0.5, deviation=0.2)).whole.deviation == pytest.approx(
+        2.0 * shares_of(curve(0.5)).whole.deviation
+    )
     for hanging in (curve(0.5)._replace(weight=np.full((500, 4), 0.1)), while_between(curve(0.5), ())):
-        assert np.isnan(share_of(hanging).value)
+        assert np.isnan(shares_of(hanging).whole.value)
 
 
 def test_the_whole_share_hides_a_joint_that_carries_little_and_its_own_share_shows_it():
@@ -220,15 +221,15 @@ def test_the_whole_share_hides_a_joint_that_carries_little_and_its_own_share_sho
     assert values["elbow share (%)"] == "100" and values["b share (%)"] == "0"
     held = curve((0.2,))
     held = held._replace(torque=held.weight * (0.0, 0.1, 0.9, 0.5))
-    assert joint_shares(held).value[1:] == pytest.approx((0.1, 0.9, 0.5))
-    assert np.isnan(joint_shares(held).value[0])
+    assert shares_of(held).joints.value[1:] == pytest.approx((0.1, 0.9, 0.5))
+    assert np.isnan(shares_of(held).joints.value[0])
 
 
 def test_an_error_of_the_weight_is_the_same_share_in_every_joint_and_does_not_average_out():
     light = curve(0.1, deviation=0.0)
     light = light._replace(deviation=0.12 * np.abs(light.weight))
-    assert share_of(light).deviation == pytest.approx(0.12)
-    assert joint_shares(light).deviation[1:] == pytest.approx(0.12)
+    assert shares_of(light).whole.deviation == pytest.approx(0.12)
+    assert shares_of(light).joints.deviation[1:] == pytest.approx(0.12)
     running, estimate = SupportAdaptation(), WearerEstimate(*(tuple(column[-1]) for column in light[1:]))
     for n in range(500):
         running.update(n * PERIOD, (POSE, STILL), estimate, SETTINGS)
@@ -246,7 +247,7 @@ def test_the_share_of_a_wearer_who_walks_is_not_biased_by_what_shakes_their_arm(
         estimates.append(observer.update(n * PERIOD, (POSE, STILL, carried.tolist()), shaken, (0.0, 0.0, 0.0), TILT))
     columns = (np.array(column) for column in zip(*estimates[100:], strict=True))
     walked = WearerCurve(PERIOD * np.arange(500.0), *columns)
-    assert share_of(walked).value == pytest.approx(0.6, abs=0.01)
+    assert shares_of(walked).whole.value == pytest.approx(0.6, abs=0.01)
     assert walked.weight == pytest.approx(np.tile(own.torque(POSE, TILT), (500, 1)))
 
 

@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 from exo_gravity.core import ArmModel, Tilt, gravity_torque
 from exo_gravity.core.arm.interface import NO_LOAD, STANDARD_GRAVITY
 from exo_gravity.sim import STEP, ArmConfig, SimulatedArm, SimulatedDevice
-from exo_gravity.sim.arm import felt_in_base, in_base
+from exo_gravity.sim.arm import in_base
 from exo_gravity.sim.trunk_motion import TrunkState
 
 from ..support.calibration_device import off_axis_of
@@ -122,7 +122,7 @@ def accelerate(arm, state, theta, velocity, torque):
     """Return the joint accelerations (4,) of the simulated left arm under `torque`."""
     arm.reset(theta)
     arm.data.qvel[:] = velocity
-    arm.move_base(*felt_in_base("left", state, STANDARD_GRAVITY))
+    arm.move_base(*arm.config.felt("left", state))
     arm.step(torque)
     return arm.data.qacc.copy()
 

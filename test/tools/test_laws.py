@@ -111,7 +111,7 @@ def test_a_function_that_the_model_can_express_is_learned_and_moving_the_premise
     inputs = RNG.uniform(-1, 1, (300, 2))
     assert anfis.train(inputs[:100], 1.0 + 2.0 * inputs[:100, 0] - inputs[:100, 1], 2).rmse < 1e-9
     output = np.sin(4 * inputs[:, 0]) * np.cos(3 * inputs[:, 1])
-    assert anfis.train(inputs, output, 3).rmse < anfis.train(inputs, output, 3, max_evaluations=1).rmse / 2
+    assert anfis.train(inputs, output, 3).rmse < anfis.train(inputs, output, 3, most=1).rmse / 2
     with pytest.raises(DataError, match="at least 256"):  # fewer samples than consequents
         anfis.train(np.zeros((200, 3)), np.zeros(200), 4)
 

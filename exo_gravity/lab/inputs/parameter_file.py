@@ -212,31 +212,25 @@ def read(text: str, source: str) -> Nodes:
     return reader.nodes(documents[0])
 
 
-class _Text(str):
-    """A string that is a value, and is written in quotes: rcl decides by its own rules what a plain one is."""
-
-
 class _Dumper(yaml.SafeDumper):
-    """Writes lists on one line. It writes no aliases, which rcl does not read: `dumped` copies every list."""
+    """Writes lists on one line, and no aliases, which rcl does not read; in quotes also what rcl takes for no text."""
+
+    def ignore_aliases(self, data: Any) -> bool:
+        return True
 
 
-_Dumper.add_representer(_Text, lambda dumper, text: dumper.represent_scalar(STRING, text, style='"'))
 _Dumper.add_representer(
-    list, lambda dumper, items: dumper.represent_sequence("tag:yaml.org,2002:seq", items, flow_style=True)
+    str, lambda dumper, text: dumper.represent_scalar(STRING, text, style="" if scalar(text) == text else '"')
 )
+for sequence in (list, tuple):
+    _Dumper.add_representer(
+        sequence, lambda dumper, items: dumper.represent_sequence("tag:yaml.org,2002:seq", items, flow_style=True)
+    )
 
 
 def dumped(content: Mapping[str, Any]) -> str:
     """Return YAML from which PyYAML and rcl read the same strings, numbers and truth values."""
-
-    def quoted(value: Any) -> Any:
-        if isinstance(value, Mapping):
-            return {key: quoted(inner) for key, inner in value.items()}
-        if isinstance(value, list | tuple):
-            return [quoted(item) for item in value]
-        return _Text(value) if isinstance(value, str) else value
-
-    return str(yaml.dump(quoted(content), Dumper=_Dumper, sort_keys=False, width=math.inf, allow_unicode=True))
+    return str(yaml.dump(content, Dumper=_Dumper, sort_keys=False, width=math.inf, allow_unicode=True))
 
 
 def text_of(nodes: Mapping[str, Mapping[str, Any]]) -> str:

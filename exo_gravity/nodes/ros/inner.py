@@ -102,7 +102,7 @@ class NodeExecutor(SingleThreadedExecutor):
 
 
 def why_too_old(node: Node) -> str:
-    """Return why the request that `node` is answering is too old to move an arm, '' if it may: also if that is not known.
+    """Return why the request that `node` is answering is too old to move an arm; '' if it is not, or that is not known.
 
     Whoever sent it no longer expects it to be carried out.
     """

@@ -160,7 +160,7 @@ V3_QUERY = replace(V3_2, name="v3_query", reports=False, assumed=_V3_ASSUMED | {
 FIRMWARES = {firmware.name: firmware for firmware in (AK, VENDOR, OPEN_DRIVE, V3, V3_2, V3_QUERY)}
 
 
-_NO_COMMAND = MotorCommand(0.0, 0.0, 0.0, 0.0, 0.0)
+NO_COMMAND = MotorCommand(0.0, 0.0, 0.0, 0.0, 0.0)
 _FULL_LENGTH = 8  # bytes of a command
 _BUS_VOLTAGE = round(24.0 / 80.0 * 0xFF)  # the last byte of a reply of 7 bytes, 0 to 80 V
 
@@ -208,11 +208,10 @@ class SimulatedMotor:
         self.has_left = False  #: its boot loader runs, and it takes no part in the bus until its next power cycle
         self.dips = 0  #: how often its time-out has taken a torque or gains away
         self._heat = heat or Heat()
-        self._zero = joint.zero  # rad, after a power cycle
         self._is_unplugged = False
+        self._zero = joint.zero  # rad, after a power cycle
         self._is_shut_off = False  # by temperature, until CLEAR_FAULTS
-        self._command = _NO_COMMAND
-        self._data: bytes | None = None  # of the last command
+        self._command = NO_COMMAND
         self._frame = bytes(_FULL_LENGTH)  # the last one that was received
         self._age = 0.0  # s since the last command
         self._silent_until = -math.inf  # s, after SET_ZERO
@@ -239,7 +238,7 @@ class SimulatedMotor:
     def _forget(self) -> None:
         """Lose what a board does not store."""
         self.entered, self.has_left, self._is_shut_off = False, False, False
-        self._command, self._data, self._frame = _NO_COMMAND, None, bytes(_FULL_LENGTH)
+        self._command, self._frame = NO_COMMAND, bytes(_FULL_LENGTH)
         self._silent_until = -math.inf
         if self.joint.zero != self._zero:
             self.joint = replace(self.joint, zero=self._zero)
@@ -282,7 +281,7 @@ class SimulatedMotor:
         elif frame in joint.exit:
             self.entered = False
             if self.firmware.exit_clears:
-                self._clear_command()
+                self._command = NO_COMMAND
         elif joint.enter and data[:-1] == b"\xff" * 7 and self.firmware.first_special <= data[-1] < 0xFF:
             # One that the manual does not name; most of them do nothing that a bus shows.
             if data[-1] == BOOT_LOADER:
@@ -307,23 +306,19 @@ class SimulatedMotor:
         self._silent_until = now + firmware.zero_silence
         return firmware.zero_silence > 0.0
 
-    def _clear_command(self) -> None:
-        self._command, self._data = _NO_COMMAND, None
-
     def _take_command(self, data: bytes) -> bool:
         """Take a command, which switches the motor on if no other frame does; return whether it is one."""
         joint = self.joint
         if not self.entered and joint.enter and not self.firmware.remembers_off:
             return len(data) == _FULL_LENGTH
-        if data != self._data:  # an arm at rest gets the same command in every cycle
-            try:
-                self._command, self._data = joint.wire_format.unpack_command(joint.spec, data), data
-            except FrameError:
-                if len(data) != _FULL_LENGTH:
-                    return False
-                # We never send it, because it is special on some firmware. This one takes it for a command.
-                fields = unpack_fields(joint.spec, int.from_bytes(data, "big"), *MotorCommand._fields)
-                self._command, self._data = MotorCommand(*fields), data
+        try:
+            self._command = joint.wire_format.unpack_command(joint.spec, data)
+        except FrameError:
+            if len(data) != _FULL_LENGTH:
+                return False
+            # We never send it, because it is special on some firmware. This one takes it for a command.
+            fields = unpack_fields(joint.spec, int.from_bytes(data, "big"), *MotorCommand._fields)
+            self._command = MotorCommand(*fields)
         self._age = 0.0
         self.entered = self.entered or not (joint.enter or self._is_refused)
         return True
@@ -335,7 +330,7 @@ class SimulatedMotor:
             return False
         current = int.from_bytes(data, "big", signed=True) / 1000.0
         torque = current * joint.spec.torque_per_ampere
-        self._command, self._data, self._age = MotorCommand(0.0, 0.0, 0.0, 0.0, torque), None, 0.0
+        self._command, self._age = MotorCommand(0.0, 0.0, 0.0, 0.0, torque), 0.0
         self.entered = not self._is_refused
         return True
 
@@ -360,8 +355,8 @@ class SimulatedMotor:
 
     def _watch(self, is_lost: bool) -> None:
         """Do what the firmware does by itself; is_lost: whether it has had no command for its time-out."""
-        if is_lost and self.entered and self._command != _NO_COMMAND:
-            self._clear_command()
+        if is_lost and self.entered and self._command != NO_COMMAND:
+            self._command = NO_COMMAND
             self.dips += 1
         if self.firmware.error_is_mask and self.temperature >= SHUT_OFF_AT:
             self.entered, self._is_shut_off = False, True

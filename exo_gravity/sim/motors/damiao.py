@@ -40,7 +40,7 @@ from exo_gravity.core.motors.damiao import (
 )
 from exo_gravity.core.motors.frames import ENTER, EXIT, SET_ZERO, MotorCommand, MotorReply, unpack_fields
 from exo_gravity.core.motors.joint_motor import JointMotor
-from exo_gravity.sim.motors.ak import Firmware, Heat, SimulatedMotor
+from exo_gravity.sim.motors.ak import NO_COMMAND, Firmware, Heat, SimulatedMotor
 
 COIL_OVER_TEMPERATURE = 0xC
 DAMIAO = Firmware(
@@ -109,7 +109,7 @@ class DamiaoMotor(SimulatedMotor):
 
     def _let_go(self) -> None:
         self.entered = False
-        self._clear_command()
+        self._command = NO_COMMAND
 
     def _forget(self) -> None:
         super()._forget()
