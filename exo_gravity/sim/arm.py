@@ -299,14 +299,12 @@ class SimulatedArm:
     @property
     def positions(self) -> list[float]:
         """Joint angles (n,) in rad."""
-        positions: list[float] = self._theta.tolist()
-        return positions
+        return list(self._theta.tolist())
 
     @property
     def velocities(self) -> list[float]:
         """Joint velocities (n,) in rad/s."""
-        velocities: list[float] = self._velocity.tolist()
-        return velocities
+        return list(self._velocity.tolist())
 
     @property
     def motor_positions(self) -> list[float]:
@@ -326,8 +324,7 @@ class SimulatedArm:
         mujoco.mj_kinematics(model, still)
         mujoco.mj_comPos(model, still)
         mujoco.mj_rne(model, still, 0, self._held)
-        weight: list[float] = self._held[: len(self._theta)].tolist()
-        return weight
+        return list(self._held[: len(self._theta)].tolist())
 
     def reset(self, theta: Vector) -> None:
         """Put the arm at rest at `theta`, (n,) rad, with no torque in elastic joints."""

@@ -25,7 +25,7 @@ import numpy as np
 
 from exo_gravity.core.errors import BusError, ParameterError
 from exo_gravity.core.motors.frames import EXTENDED, Frame
-from exo_gravity.core.numbers import JOINT_COUNT, Torque, clamp, for_joints
+from exo_gravity.core.numbers import JOINT_COUNT, Torque, for_joints
 from exo_gravity.hardware.can_port import POLL_TIME, message_of
 from exo_gravity.sim.arm import STEP, SimulatedArm
 from exo_gravity.sim.motors.ak import SimulatedMotor
@@ -57,7 +57,7 @@ class VirtualWearer:
         self.step: int | None = None
         self._elapsed = 0.0
         self._start: Sequence[float] = ()
-        self._weight: list[float] = []
+        self._weight = np.zeros(0)  # Nm, that the hand has taken over
 
     def torque(self, elapsed: float, theta: Sequence[float], velocity: Sequence[float]) -> Torque:
         """Return the wearer's torque (n,) in Nm on the joints, `elapsed` s after the start of the script.
@@ -72,31 +72,23 @@ class VirtualWearer:
         if index != self.step:
             self.step = index
             self._start = theta
-            self._weight = [0.0] * len(theta)
+            self._weight = np.zeros(len(theta))
         period, self._elapsed = elapsed - self._elapsed, elapsed
         if index == len(self.script.steps):
             return nothing
         step = self.script.steps[index]
         if step.action == "move":
-            path = path_between(self._start, step.value, since, MOVING * step.duration)
-            return self.lead(path, theta, velocity, period)
+            compliance = (for_joints(tuning, len(theta)) for tuning in (STIFFNESS, DAMPING, INTEGRAL))
+            stiffness, damping, integral = map(np.array, compliance)
+            position, speed = np.transpose(path_between(self._start, step.value, since, MOVING * step.duration))
+            error, limit = position - theta, self.strength
+            self._weight = np.clip(self._weight + integral * error * period, -limit, limit)
+            pull = stiffness * error + damping * (speed - velocity) + self._weight
+            return tuple(np.clip(pull, -limit, limit).tolist())
         if step.action == "push":
             share = math.sin(math.pi * since / step.duration)
             return tuple(share * torque for torque in step.value)
         return nothing
-
-    def lead(self, path: Course, theta: Sequence[float], velocity: Sequence[float], period: float) -> Torque:
-        """Return the torque (n,) in Nm of a hand that leads the joints along `path`; period: s since the last call."""
-        torque, limit = [], self.strength
-        self._weight = self._weight or [0.0] * len(path)
-        compliance = (for_joints(tuning, len(path)) for tuning in (STIFFNESS, DAMPING, INTEGRAL))
-        for n, ((position, speed), *hand) in enumerate(zip(path, *compliance, strict=True)):
-            stiffness, damping, integral = hand
-            error = position - theta[n]
-            self._weight[n] = clamp(self._weight[n] + integral * error * period, limit)
-            pull = stiffness * error + damping * (speed - velocity[n]) + self._weight[n]
-            torque.append(clamp(pull, limit))
-        return tuple(torque)
 
 
 def path_between(start: Sequence[float], end: Sequence[float], since: float, duration: float) -> Course:

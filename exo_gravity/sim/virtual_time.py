@@ -13,6 +13,7 @@ import math
 import random
 from collections import deque
 from collections.abc import Callable, Hashable, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field
 from functools import partial
 from typing import Any
@@ -43,11 +44,6 @@ class CanController:
     tec: int = 0  #: Transmit error counter.
     ready: float = -math.inf  #: s from which it may begin.
     off_until: float = -math.inf  #: s until which it is off the bus.
-
-    def suspend(self, end: float, bitrate: int) -> None:
-        """Wait after a frame that it sent and that ended at `end` s, if it is error passive."""
-        if self.tec >= PASSIVE_FROM:
-            self.ready = end + SUSPENDED_BITS / bitrate
 
 
 class Arbitration:
@@ -137,7 +133,8 @@ class Arbitration:
         for controller in senders:
             controller.tec = max(0, controller.tec - 1)
         for controller in (*senders, *failed):
-            controller.suspend(self._clock.monotonic(), self._bitrate)
+            if controller.tec >= PASSIVE_FROM:
+                controller.ready = self._clock.monotonic() + SUSPENDED_BITS / self._bitrate
         self._is_busy = False
         self._clock.later(0.0, self._begin)
         for sender, message, _ in sent[:1]:
@@ -276,7 +273,8 @@ class VirtualBus(can.BusABC):
     def shutdown(self) -> None:
         """Leave the wire."""
         self._has_left = True
-        self._wire.leave(self)
+        with suppress(ValueError):  # it has left already
+            self._wire.ends.remove(self)
 
     def _check(self) -> None:
         if self._has_left:
@@ -397,10 +395,6 @@ class Wire:
         self.broken = {end for end in self.ends if isinstance(end, VirtualBus)}
         self.error = error
 
-    def repeat(self, message: can.Message, period: float) -> Callable[[], None]:
-        """Let another sender send `message` every `period` s; return a function that ends it."""
-        return self.clock.every(period, partial(self.carry, None, message))
-
     def carry(
         self, sender: object, message: can.Message, controller: Hashable = None, retransmits: bool = True
     ) -> None:
@@ -421,8 +415,3 @@ class Wire:
         for end in tuple(self.ends):
             if end is not sender or (self._echoes and isinstance(end, VirtualBus)):
                 end.deliver(message)
-
-    def leave(self, end: VirtualBus) -> None:
-        """Disconnect an end."""
-        if end in self.ends:
-            self.ends.remove(end)

@@ -38,8 +38,6 @@ from exo_gravity.lab.processes import (
 )
 from exo_gravity.tools.cli import print_any_character
 
-LOG_LEVELS = ("debug", "info", "warn", "error", "fatal")
-
 
 def print_line(node: str, line: str) -> None:
     """Print one line of a node's log, with the time of day and the node's name."""
@@ -68,7 +66,8 @@ def _arguments(args: Sequence[str] | None) -> argparse.Namespace:
         "--remap", metavar="FROM:=TO", action="append", default=[],
         help="let every node use another topic, as the -r of ROS does",
     )  # fmt: skip
-    parser.add_argument("--log-level", default="info", choices=LOG_LEVELS, help="of every node (default: info)")
+    levels = "debug", "info", "warn", "error", "fatal"
+    parser.add_argument("--log-level", default="info", choices=levels, help="of every node (default: info)")
     return parser.parse_args(args)
 
 

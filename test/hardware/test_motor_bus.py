@@ -180,7 +180,7 @@ def test_a_late_reply_does_not_count_for_the_next_cycle(bus, other):
 
 
 def test_an_arm_that_answers_another_host_is_noticed_while_listening(wire, bus):
-    wire.repeat(frame(1, REPLY), 0.01)
+    wire.clock.every(0.01, lambda: wire.carry(None, frame(1, REPLY)))
     with pytest.raises(BusError, match="is in use: motor 1 replies to another host"):
         bus.listen()
 

@@ -233,8 +233,9 @@ def test_an_error_of_the_weight_is_the_same_share_in_every_joint_and_does_not_av
     running, estimate = SupportAdaptation(), WearerEstimate(*(tuple(column[-1]) for column in light[1:]))
     for n in range(500):
         running.update(n * PERIOD, (POSE, STILL), estimate, SETTINGS)
-    shares = running.shares
-    assert shares.whole == pytest.approx((0.1, 0.12)) and np.array(shares.joints)[:, 1] == pytest.approx((0.1, 0.12))
+    assert running.shares.whole == pytest.approx((0.1, 0.12)) and np.array(running.shares.joints)[
+        :, 1
+    ] == pytest.approx((0.1, 0.12))
 
 
 def test_the_share_of_a_wearer_who_walks_is_not_biased_by_what_shakes_their_arm():
@@ -260,7 +261,6 @@ def test_a_recording_is_sampled_100_times_a_second_and_samples_without_effort_ar
     assert np.diff(found.time[:50]) == pytest.approx(PERIOD)
     assert not np.any((found.time > 0.8) & (found.time < 0.998))
     assert found.torque == pytest.approx(0.0, abs=1e-9)
-    assert OBSERVER.bandwidth * PERIOD < 0.5  # the sampled low-pass is still one
 
 
 def watched(settings=SETTINGS, effort=None):

@@ -361,9 +361,6 @@ def test_a_load_is_weighed_on_request_and_one_that_is_dropped_is_no_longer_a_par
     refused = weigh()
     assert not refused.success and "support 1" in refused.message
     rig.wait_for({"weigh refused": "support", "weighing number": "0"})
-    with monkeypatch.context() as slow_network:
-        slow_network.setattr(inner, "REQUEST_LIFE", -1.0)
-        assert "s old" in weigh().message
     assert rig.set(mode="zero_g", support=1.0) == ["", ""]
     rig.wait_until(lambda: rig.values["changing load"] == "none" and weigh().success)
     rig.wait_for({"weighing": "taking_over", "weighing number": "1"})
@@ -373,6 +370,8 @@ def test_a_load_is_weighed_on_request_and_one_that_is_dropped_is_no_longer_a_par
     rig.velocity, rig.effort = [0.0, 0.0, 1.5, 2.0], []  # whether the motors carry it is not known
     rig.wait_for({"payload mass (kg)": "0.000"})
     assert rig.node.get_parameter("payload.mass").value == 0.0
+    monkeypatch.setattr(inner, "REQUEST_LIFE", -1.0)
+    assert "s old" in weigh().message
 
 
 @pytest.mark.thorough
@@ -570,13 +569,7 @@ def test_beside_a_compensator_that_hangs_nothing_is_known_of_the_wearer(make_rig
     torques = rig.estimates[""]
     rig.wait_until(lambda: rig.torques == NONE and torques)
     rig.is_stopped = True  # the wearer's own thread goes on
-
-    def are_at_an_end() -> bool:
-        told, end = len(torques), time.monotonic() + 0.5
-        rig.wait_until(lambda: time.monotonic() > end)
-        return len(torques) == told
-
-    rig.wait_until(are_at_an_end)
+    rig.wait_until(lambda: time.time_ns() - to_nanoseconds(torques[-1].header.stamp) > 0.5e9)
     rig.is_stopped = False
     told = len(torques)
     rig.wait_until(lambda: len(torques) > told and rig.torques == NONE)
@@ -620,15 +613,12 @@ def test_the_support_follows_an_arm_that_sinks_and_returns_when_the_node_ends_wh
     rig.wait_until(lambda: asked() > 0.4 and in_use() > 0.4)
     sinking[0] = 0.0
     assert rig.values["support"] == "0.4"
-    assert rig.set(model_error__wearer=0.3) == [""]
-    rig.wait_until(lambda: asked() == 0.4 and rig.found("support adapts") == "held")
-    assert rig.set(model_error__wearer=0.03) == [""]
     state = DiagnosticStatus(name="right/can_bridge", values=[KeyValue(key="state", value="letting down")])
     bridge = rig.user.create_publisher(DiagnosticArray, "/diagnostics", 10)
     rig.wait_until(
         lambda: (
             bridge.publish(DiagnosticArray(status=[state]))
-            or rig.found("support adapts text") == "the arm is not carried"
+            or (asked() == 0.4 and rig.found("support adapts text") == "the arm is not carried")
         )
     )
     sinking[0] = 0.0004

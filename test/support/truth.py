@@ -1,7 +1,6 @@
 # Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
 """Reads the truth log of a simulated device while it grows; exo_gravity/sim/device.py describes the format."""
 
-from bisect import bisect_left
 from pathlib import Path
 
 import numpy as np
@@ -29,11 +28,8 @@ class Truth:
 
     def since(self, time: float) -> np.ndarray:
         """Return the records from `time` (wall clock, s) on."""
-        count = self.count
-        if not count:
-            return np.empty(0, self._record)
-        records = np.memmap(self.path, self._record, "r", shape=(count,))
-        return self._read(bisect_left(range(count), time, key=lambda index: records["time"][index]), count)
+        records = self._read(0, self.count)
+        return records[records["time"] >= time]
 
     def motors_are_off(self) -> bool:
         """Return whether no motor is on."""

@@ -238,9 +238,6 @@ def text_of(nodes: Mapping[str, Mapping[str, Any]]) -> str:
     return dumped({node: {PARAMETERS: dict(values)} for node, values in nodes.items()})
 
 
-RECORDED_TEXTS = 32  # remembered of a recording: more than it has nodes whose parameters are used
-
-
 def packaged_config(name: str) -> Path:
     """Return the path of a file of `config/`. Raises ParameterError if it is not installed."""
     if (path := packaged(name)) is None:
@@ -264,7 +261,7 @@ def load(path: str | Path) -> Nodes:
     return nodes
 
 
-@lru_cache(RECORDED_TEXTS)
+@lru_cache(32)  # more than a recording has nodes whose parameters are used
 def recorded_parameters(text: str, node: str) -> Mapping[str, Any]:
     """Return the parameters of `node` by name, from the text that the recorder wrote. Raises DataError."""
     try:

@@ -141,7 +141,7 @@ def test_a_reply_that_fits_no_motor_and_a_board_that_cannot_be_used_are_reported
     wire: Wire, reply: can.Message, period: float, problem: str
 ) -> None:
     if period:
-        wire.repeat(reply, period)
+        wire.clock.every(period, lambda: wire.carry(None, reply))
     else:
         Responder(wire, lambda message: [reply] if message.arbitration_id == 3 else [])
     with scan_of(wire) as bus:
@@ -186,7 +186,7 @@ def test_a_bus_that_a_bridge_holds_or_has_left_with_motors_on_is_refused_and_fre
     ("command", "can_id"), [(frame(2, DAMPED), 2), (frame(0x0803, bytes(8), is_extended_id=True), 2051)]
 )
 def test_a_bus_on_which_another_host_commands_a_motor_is_refused(wire: Wire, command: can.Message, can_id: int) -> None:
-    wire.repeat(command, 0.01)
+    wire.clock.every(0.01, lambda: wire.carry(None, command))
     with pytest.raises(BusError, match=f"a frame with ID {can_id} was heard"):
         scan_of(wire)
 
