@@ -109,13 +109,13 @@ class TouchWatch:
         carried: (n,) Nm, what is asked of the motors beyond the robot's weight.
         lacking: (n,) Nm, what is asked of them and not applied.
         """
-        dt, gain = now - self.time, TOUCH.bandwidth
+        dt = now - self.time
         if dt <= PAUSE:
             self._passed = self._passed + dt * (self._known + self._touch)
-            self._touch = gain * (momentum - self._passed)
+            self._touch = min(TOUCH.bandwidth, 1.0 / dt) * (momentum - self._passed)  # 1 / dt: stable at slow looks
         else:
             dt, self._touch, self._is_applied, self._free_for = 0.0, -carried, False, 0.0
-            self._passed = momentum - self._touch / gain
+            self._passed = momentum - self._touch / TOUCH.bandwidth
         self.time, self._known = now, known
         allowed = TOUCH.share * np.abs(carried) + TOUCH.least
         is_loaded = np.sum(np.abs(carried) >= TOUCH.heavy) >= TOUCH.joints
