@@ -17,6 +17,7 @@ import re
 import signal
 import threading
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -394,6 +395,8 @@ def test_lines_of_the_calibrator_are_followed_and_observations_are_kept(tmp_path
     assert tour.measured[0].speed == 0.1 and json.loads(record.read_text())["observation"] == values
     with pytest.raises(DataError, match=r"elbow: a hand; what was measured is kept in .*new.jsonl"):
         tour.complete(record)
+    tour.follow(json.dumps({"observation": values}), Path("/dev/full"), said.append)
+    assert len(tour.measured) == 2 and said[1] == "pose 2 is used, but is missing in /dev/full: No space left on device"
 
 
 def test_no_tour_begins_on_an_arm_that_a_running_bridge_may_carry(tmp_path, monkeypatch):

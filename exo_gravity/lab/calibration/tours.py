@@ -109,13 +109,19 @@ class LiveTour:
     done: bool = False  #: whether it is complete
 
     def follow(self, line: str, record: Path, say: Say) -> None:
-        """Take one line of `calibrator`; ignore half a line, which a killed node leaves."""
+        """Take one line of `calibrator`; ignore half a line, which a killed node leaves.
+
+        A pose that cannot be recorded counts all the same, and is said.
+        """
         with contextlib.suppress(json.JSONDecodeError):
             event = json.loads(line)
             if "observation" in event:
-                with record.open("a", encoding="utf-8") as file:
-                    file.write(line + "\n")
                 self.measured.append(Observation(**event["observation"]))
+                try:
+                    with record.open("a", encoding="utf-8") as file:
+                        file.write(line + "\n")
+                except OSError as error:
+                    say(f"pose {len(self.measured)} is used, but is missing in {record}: {error.strerror}")
             elif event.get("progress"):
                 say(event["progress"])
             elif not self.done:
