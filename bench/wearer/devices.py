@@ -91,7 +91,7 @@ def draw(seed: int) -> Worn:
     true = Device(seed, effects=())
     bare = file_of(true, true.observations()[0])
     assert bare.identified is not None
-    left = -bare.identified.tilt  # the IMU was mounted well, and is corrected by this
+    left = -bare.identified.value.tilt  # the IMU was mounted well, and is corrected by this
     body_mass = float(rng.uniform(*BODY_MASS))
     load = Wearer(body_mass).on_links(LENGTH)
     mechanics: dict[str, Any] = {

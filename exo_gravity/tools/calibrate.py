@@ -87,7 +87,7 @@ def _arguments(args: Sequence[str] | None) -> argparse.Namespace:
             option(
                 "--axes", type=float, metavar="DEG",
                 help="assumed standard error of each joint's axis in each direction across it, by CAD or "
-                "brackets (0.6)",
+                "brackets (0.6); of an arm from a URDF",
             )  # fmt: skip
         if name == "scale":
             option("--mass", type=float, required=True, metavar="KG", help="of the weight")

@@ -323,7 +323,7 @@ def outcome(touched: float = 0.0) -> CalibrationResult:
         for theta, torque, loaded in zip(POSES, effort, LOADED, strict=True)
     )
     result = identification.identify(taken, PAPERS)
-    change = Change(COMPENSATOR, "robot.first_moment", result.moments.tolist(), "kg m, <±0.001>")
+    change = Change(COMPENSATOR, "robot.first_moment", result.value.moment.tolist(), "kg m, <±0.001>")
     return CalibrationResult((change,), ("M4 is 20 % larger.",), (), configured_arm(), PAPERS, taken, result)
 
 
@@ -341,9 +341,9 @@ def test_the_page_compares_the_old_and_the_new_file_with_what_was_measured(found
     old, new, *_ = remainders_of(found)
     measured, result = np.array([o.effort for o in found.observations]), found.identified
     assert (measured - old) == pytest.approx(predicted(IN_FILE))
-    down = DOWN + np.cross(result.tilt, DOWN)  # the new file's mounting of the IMU
-    joints = POSES[~LOADED] + result.turn[:, 0]  # as the new zeros show them
-    unloaded = PAPERS.rows(joints, down / np.linalg.norm(down)) @ result.in_file / result.scale
+    down = DOWN + np.cross(result.value.tilt, DOWN)  # the new file's mounting of the IMU
+    joints = POSES[~LOADED] + result.value.turn[:, 0]  # as the new zeros show them
+    unloaded = PAPERS.rows(joints, down / np.linalg.norm(down)) @ result.value.moment / result.value.scale
     assert (measured - new)[~LOADED] == pytest.approx(unloaded, abs=1e-3)
     assert np.abs(old).max() > 10.0 * np.abs(new).max()
 

@@ -97,11 +97,11 @@ def test_a_tour_of_an_arm_with_or_without_cables_holds_it_to_1_percent_of_peak_i
     tour, seen = run.run(Itinerary(run.limits, 12)), Tilt.of("right", *run.tilt)
     assert tour.trouble == "" and tour.measured[0].temperature == (30.0,) * 4
     result = moments_from(ARM, tour.measured)
-    assert np.any(result.identified.stiffness > 0.0) == bool(cables)
+    assert np.any(result.identified.value.spring > 0.0) == bool(cables)
     found = {change.name: change.value for change in result.changes}
     settings, device = settings_of({**ARM.compensator, "use_imu": True, **found}), SimulatedArm(truth)
     true = np.array([holding(device, theta, seen) for theta in POSES])
-    held = np.array([settings.torque(theta, seen)[0] for theta in POSES.tolist()]) / result.identified.scale
+    held = np.array([settings.torque(theta, seen)[0] for theta in POSES.tolist()]) / result.identified.value.scale
     assert np.abs(held - true).max() < 0.01 * np.abs(true).max()
 
 
@@ -113,13 +113,13 @@ def sprung(device: Device) -> list[Observation]:
 
 def test_springs_are_found_where_there_are_some_and_nowhere_else_nor_where_a_hand_was_on_the_arm_in_one_pose() -> None:
     found = identify(sprung(Device(300)), PAPERS)
-    np.testing.assert_allclose(found.stiffness[1:], 0.15, atol=0.02)
-    assert np.all(np.abs(found.stiffness - 0.15)[1:] < 3.5 * found.stiffness_error[1:])
-    assert not np.any(identify(Device(300).tour(bare=8, weighed=8), PAPERS).stiffness)
+    np.testing.assert_allclose(found.value.spring[1:], 0.15, atol=0.02)
+    assert np.all(np.abs(found.value.spring - 0.15)[1:] < 3.5 * found.error.spring[1:])
+    assert not np.any(identify(Device(300).tour(bare=8, weighed=8), PAPERS).value.spring)
     tour = Device(7).tour(bare=12, weighed=0)
     tour[5] = tour[5]._replace(effort=tour[5].effort + np.array((0.0, 0.0, 0.8, 0.0)))
     found = identify(tour, PAPERS)
-    assert [index for index, _ in found.rejected] == [5] and not np.any(found.stiffness)
+    assert list(found.rejected) == [5] and not np.any(found.value.spring)
 
 
 def test_the_file_gets_the_springs_and_the_room_that_the_safety_machine_needs_for_them() -> None:

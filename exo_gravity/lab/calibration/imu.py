@@ -356,7 +356,7 @@ def mounting_turn(found: Identified) -> tuple[float, float, np.ndarray]:
     square, axes = np.linalg.eigh(found.tilt_covariance)  # the last is nearly gravity's own axis
     error, heading_error = math.sqrt(max(0.0, square[0] + square[1])), math.sqrt(max(0.0, square[2]))
     is_whole = heading_error < LARGEST_HEADING_ERROR
-    return error, heading_error, found.tilt if is_whole else axes[:, :2] @ axes[:, :2].T @ found.tilt
+    return error, heading_error, found.value.tilt if is_whole else axes[:, :2] @ axes[:, :2].T @ found.value.tilt
 
 
 def turned(rotation: Vector, turn: np.ndarray) -> np.ndarray:

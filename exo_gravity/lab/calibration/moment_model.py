@@ -25,12 +25,11 @@ from exo_gravity.hardware.urdf_arm import MOMENT_NAMES, TURN_NAMES, UrdfArm, arm
 
 # deg of each joint, within the paper's ranges: from these a missing pose is suggested.
 GRID = ((-60, 0, 60), (15, 45, 75, 105, 135), (-30, 0, 30, 60, 90, 120), (0, 30, 60, 90, 120, 150))
-TURNS = 3  # of a joint's place: about its axis, and about two directions across it
 SUGGESTED = 600  # poses at random, from which one is suggested for another arm
 STEP = 10.0  # deg, of their angles
 FITTED = 60  # poses in which the moments of an arm are found from its torque
 DEPENDENT = 1e-6  # of the largest column: what is left of one that depends on others
-LITTLE = 1e-6  # Nm per kg m: a joint that carries less carries nothing
+LITTLE = 0.1  # Nm per kg m: a joint that carries less carries nothing
 TURN = np.cross(np.eye(3), np.eye(3)[:, None])  # (3, 3, 3): v @ TURN has the rows v x X, v x Y and v x Z
 MOMENT_PARAMETERS = {"robot.first_moment": slice(JOINT_COUNT), "robot.off_axis": slice(JOINT_COUNT, None)}
 
@@ -48,12 +47,12 @@ class MomentModel:
 
     count, names, moments: n joints; of the k moments their names, and kg m as far as known.
     suggested: (m, n) rad, poses from which a missing one is taken.
-    shows_tilt: whether gravity's direction is fitted, too: its turn is also one of the first joint's place.
     """
 
     #: Whether a description says about what the arm weighs and its motors give. The file holds what differs from it:
     #: first moments of the links, and axes that are askew. Else it holds the moments, and a fit begins without such.
     is_described = False
+    fitted_turns = 1  #: of each joint's place: about its axis; a description also holds those across it
     at_least_0: tuple[int, ...] = (0,)  #: moments that are 0 where they seem to be less
     across: tuple[tuple[int, int], ...] = ((7, 3), (6, 2))  #: of one across a link, and of the larger one along it
     rises_from = 2  #: the first link that may not point far upwards
@@ -69,7 +68,7 @@ class MomentModel:
 
     def __init__(self, arm: Arm, uses_imu: bool, rotors: Sequence[float] = ()) -> None:
         self.arm, self.gravity, self.count = arm, arm.gravity, len(self.directions)
-        self.keeps_tilt, self.shows_tilt = uses_imu, uses_imu or not self.is_described
+        self.keeps_tilt = uses_imu
         self._rotors = np.diag(rotors) if len(rotors) else np.zeros((self.count, self.count))
         self.moments = self.moments_of(arm)
         self.suggested = self._suggested()
@@ -147,14 +146,14 @@ class MomentModel:
         return np.asarray(mass * lever * (across @ self._on_last[1:]).T)
 
     def turned(self, theta: np.ndarray) -> np.ndarray:
-        """Return the derivative (m, n, k, 3, 3 n) of `along_axes` by turns of the joints' places.
+        """Return the derivative (m, n, k, 3, t) of `along_axes` by `fitted_turns` of each joint's place.
 
         A moment v loads the joint with axis a by -(a x v) . gravity. A turn w of joint j turns all that j moves, except
         the moment along its axis, which counts as one of the link before: a fit takes what is missing for moments of
         that link.
         """
         turns, moments, moved = self._turned(theta)
-        axes = turns[:, :, 0]
+        axes, turns = turns[:, :, 0], turns[:, :, : self.fitted_turns]
         cross = np.cross(axes[:, :, None], moments[:, None]) * moved[..., None]  # (m, n, k, 3)
         # By joint j and its turn t: (m, n, k, j, t, 3)
         both = np.cross(turns[:, None, None], cross[:, :, :, None, None])
@@ -203,7 +202,7 @@ class DescribedModel(MomentModel):
     Raises ParameterError if a joint that is not the arm's moves its links, or one of them follows another.
     """
 
-    is_described = True
+    is_described, fitted_turns = True, 3
     rises_from = 0
     at_least_0 = across = comfortable = ()  # a description says enough of its moments
     arm: UrdfArm

@@ -173,16 +173,17 @@ def remainders(
 ) -> tuple[np.ndarray, ...]:
     """Return measured minus predicted torque (m, n) in Nm as commanded, and which of the poses (m,) were used.
 
-    Predicted by the old file; by the new one, which holds less than the fit (`held`); and by a result that was found
-    without that pose.
+    Predicted by the old file; by the new one, which lacks the offsets of joints without a spring; and by a result that
+    was found without that pose.
     """
     theta, direction, measured, _ = columns(poses)
     loads = np.array([model.load(pose.load_mass, pose.load_lever) for pose in poses])
     rows = model.rows(theta, direction)
     springs = joint_spring_of(arm.compensator).torques(theta)
     old = measured - np.einsum("njk,nk->nj", rows, model.moments + loads) - springs
-    used = ~np.isin(np.arange(len(poses)), [index for index, _ in found.rejected])
-    return old, found.remainder, found.held_out + found.remainder - found.residual, used
+    used = ~np.isin(np.arange(len(poses)), list(found.rejected))
+    lacking = found.value.offset * (found.value.spring == 0.0)
+    return old, found.residual + lacking, found.held_out + lacking, used
 
 
 def page_of(result: CalibrationResult, command: str, params: str, today: datetime.date | None = None) -> str:

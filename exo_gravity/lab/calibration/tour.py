@@ -30,7 +30,7 @@ from exo_gravity.core.numbers import Torque, Vector
 from exo_gravity.core.params import Param, table_for
 from exo_gravity.core.safety.command import Efforts
 from exo_gravity.core.safety.limits import CAN_BRIDGE, WALL, Limits
-from exo_gravity.lab.calibration.identification import EXACT, columns, known_of, layout_of, next_pose, rows_at, solve
+from exo_gravity.lab.calibration.identification import EXACT, Unknowns, columns, known_of, next_pose, rows_at, solve
 from exo_gravity.lab.calibration.moment_model import MomentModel, model_of
 from exo_gravity.lab.calibration.tracking import MOTION, Line, Observation, Station, Sweep, Tracker, average, followed
 from exo_gravity.sim.controllers import SampleController
@@ -89,22 +89,24 @@ class TorqueGuess:
     def __init__(
         self, model: MomentModel, load: tuple[float, float] = (0.0, 0.0), seen: Sequence[Observation] = ()
     ) -> None:
-        self.model, self._load, self._at = model, load, layout_of(model, 0)
+        self.model, self._load = model, load
         known = known_of(model, None, False)
-        for part in (self._at.angle, self._at.tilt, self._at.slope):
-            known.error[part] = EXACT
+        error = Unknowns.of(known.error, model)
+        for part in (error.angle, error.tilt, error.slope):
+            part[:] = EXACT
         self._unknowns, self._covariance = known.start, np.diag(known.error**2)
         if seen:
             theta, direction, effort, spread = columns(seen)
             hung = np.array([model.load(one.load_mass, one.load_lever) for one in seen])
             rows = rows_at(model, theta, direction)._replace(load=hung)
             unexplained = np.hypot(GUESS.unexplained, GUESS.share * effort)
-            fit = solve(rows, known, effort, np.hypot(spread, unexplained), steps=1)
+            fit = solve(rows, known, effort, np.hypot(spread, unexplained), passes=1)
             self._unknowns, self._covariance = fit.unknowns, fit.covariance
-        self.moments = self._unknowns[self._at.moment] + model.load(*load)
-        self._share = np.exp(-self._unknowns[self._at.scale])  # commanded torque by torque
+        value = Unknowns.of(self._unknowns, model)
+        self.moments = value.moment + model.load(*load)
+        self._share = np.exp(-value.scale)  # commanded torque by torque
         self._arm = model.holding(self.moments)
-        parts = (self._share, self._unknowns[self._at.spring], self._unknowns[self._at.offset])
+        parts = (self._share, value.spring, value.offset)
         self._joints = list(zip(*(part.tolist() for part in parts), strict=True))
 
     def torque(self, theta: Sequence[float], tilt: Tilt) -> Torque:
@@ -117,7 +119,7 @@ class TorqueGuess:
 
         direction: (3,), gravity's unit vector in the base frame.
         """
-        rows = rows_at(self.model, theta, np.broadcast_to(direction, (len(theta), 3)))
+        rows = rows_at(self.model, theta, direction)
         rows = rows._replace(load=rows.load + self.model.load(*self._load))
         mean, jacobian = rows.predicted(self._unknowns), rows.jacobian(self._unknowns)
         variance = np.einsum("mnt,mnt->mn", jacobian @ self._covariance, jacobian)

@@ -37,7 +37,7 @@ from rich.console import Console, Group, RenderableType
 from rich.live import Live
 from rich.text import Text
 
-from exo_gravity.core.arm.springs import Springs, link_angles
+from exo_gravity.core.arm.springs import MAX_REST, Springs, link_angles
 from exo_gravity.core.arm.wearer import MAX_TISSUE, TISSUE_REACH
 from exo_gravity.core.compensation.laws import LAWS
 from exo_gravity.core.compensation.settings import ModelError, joint_spring_of, wearer_of
@@ -47,18 +47,20 @@ from exo_gravity.core.numbers import COVER, for_joints, one_float
 from exo_gravity.hardware.urdf_arm import TURN_NAMES
 from exo_gravity.lab.calibration import moment_model
 from exo_gravity.lab.calibration.identification import (
+    AS_USUAL,
     EXACT,
     Identified,
     Known,
     Places,
+    Unknowns,
     columns,
     fit_friction,
-    held,
     identify,
-    layout_of,
+    known_of,
     next_pose,
     rows_at,
     temperatures,
+    torque_error,
     with_springs,
 )
 from exo_gravity.lab.calibration.moment_model import MOMENT_PARAMETERS, MomentModel
@@ -295,16 +297,15 @@ def _needed(arm: ConfiguredArm, model: MomentModel, poses: Sequence[Observation]
 
 
 def moments_from(
-    arm: ConfiguredArm, observations: Sequence[Observation], places: Places | None = None
+    arm: ConfiguredArm, observations: Sequence[Observation], places: Places = AS_USUAL
 ) -> CalibrationResult:
     """Return moments and torque scales of `arm` as `observations` show them. Raises DataError as `identify` does.
 
-    places: how exactly its zeros and axes are known; by default as usual.
+    places: how exactly its zeros and axes are known.
     """
     model, (low, high), observations = model_of(arm), TORQUE_SCALE_BOUNDS, at_links(arm, observations)
     found = identify(observations, model, places)
-    factor = np.where(np.isfinite(found.scale_error), found.scale, 1.0)
-    scale = np.round(factor * _scale_before(arm, found), 4).tolist()
+    scale = np.round(found.value.scale * _scale_before(arm, found), 4).tolist()
     impossible = tuple(
         f"{name}: torque_scale = {value:g}: must be from {low:g} to {high:g}: check torque_range of its firmware"
         for name, value in zip(arm.joint_names, scale, strict=True)
@@ -335,11 +336,10 @@ def _scale_before(arm: ConfiguredArm, found: Identified) -> np.ndarray:
 
 def _moment_changes(arm: ConfiguredArm, model: MomentModel, found: Identified) -> Iterator[Change]:
     """Yield the new moments. What is unknown keeps its value."""
-    node, before, error = f"{arm.namespace}/compensator", model.moments, found.error
+    node, before, error = f"{arm.namespace}/compensator", model.moments, found.error.moment
     unit = "as commanded; in kg m once a weight was hung" if found.relative else "kg m"
-    moments = np.where(np.isfinite(error), found.in_file, before)
     known = f"{unit}, +-{np.max(error, where=np.isfinite(error), initial=0.0):.2g} at most"
-    for name, values in model.in_file(moments, found.turn).items():
+    for name, values in model.in_file(found.value.moment, found.value.turn).items():
         if part := MOMENT_PARAMETERS.get(name):
             note = f"{' '.join(model.names[part])} {unit}, +-{row(error[part])}, was {row(before[part])}"
         else:
@@ -351,7 +351,7 @@ def _changes(arm: ConfiguredArm, model: MomentModel, found: Identified, scale: l
     """Return the new values of the parameter file."""
     node, changes = f"{arm.namespace}/compensator", [*_moment_changes(arm, model, found)]
     changes += [
-        Change(f"{arm.namespace}/can_bridge", "torque_scale", scale, f"+-{row(found.scale_error)}"),
+        Change(f"{arm.namespace}/can_bridge", "torque_scale", scale, f"+-{row(found.error.scale)}"),
         *_zero_changes(arm, found),
         *_temperature_changes(arm, found),
         *_spring_changes(arm, found),
@@ -359,8 +359,8 @@ def _changes(arm: ConfiguredArm, model: MomentModel, found: Identified, scale: l
     note = "Nm, in poses that no tour visited"
     changes.append(Change(node, "model_error.torque", found.torque_error.round(4).tolist(), note))
     if not found.relative:
-        known = np.isfinite(found.scale_error)
-        share = np.where(known, found.scale_error / found.scale, for_joints(ModelError().scale, len(scale), max))
+        known = np.isfinite(found.error.scale)
+        share = np.where(known, found.error.scale / found.value.scale, for_joints(ModelError().scale, len(scale), max))
         changes.append(Change(node, "model_error.scale", share.round(4).tolist(), "share of torque_scale"))
     changes += exact_law(arm)
     if any(gain != 1.0 for gain in arm.compensator["gain"]):
@@ -377,8 +377,8 @@ def exact_law(arm: ConfiguredArm) -> Iterator[Change]:
 
 def _zero_changes(arm: ConfiguredArm, found: Identified) -> Iterator[Change]:
     """Yield the zeros of the encoders."""
-    bridge, (degrees, error) = arm.can_bridge, np.degrees((found.turn[:, 0], found.turn_error[:, 0]))
-    zero = np.array(bridge["zero"]) - np.array(bridge["direction"]) * found.turn[:, 0]
+    bridge, (degrees, error) = arm.can_bridge, np.degrees((found.value.turn[:, 0], found.error.turn[:, 0]))
+    zero = np.array(bridge["zero"]) - np.array(bridge["direction"]) * found.value.turn[:, 0]
     # A zero that no pose shows keeps the value of the file, and its error means nothing.
     note = (
         f"rad; the joints are {row(degrees)} degrees farther than the file said, "
@@ -394,19 +394,22 @@ def _temperature_changes(arm: ConfiguredArm, found: Identified) -> Iterator[Chan
         return
     yield Change(node, "torque_scale_temperature", found.temperature.round(1).tolist(), "degC, mean of the tours")
     given = np.array(bridge["torque_scale_slope"])
-    if np.any(given) or np.any(found.slope):
-        slope = given * bridge["torque_scale"] / _scale_before(arm, found) + found.slope
-        note = f"1/K, +-{row(found.slope_error)}; 0: the poses show none, the file's is kept"
+    if np.any(given) or np.any(found.value.slope):
+        slope = given * bridge["torque_scale"] / _scale_before(arm, found) + found.value.slope
+        note = f"1/K, +-{row(found.error.slope)}; 0: the poses show none, the file's is kept"
         yield Change(node, "torque_scale_slope", slope.round(5).tolist(), note)
 
 
 def _spring_changes(arm: ConfiguredArm, found: Identified) -> Iterator[Change]:
     """Yield the device's own springs, and the torque that they may add beyond gravity, where the file states one."""
     node, before = f"{arm.namespace}/compensator", joint_spring_of(arm.compensator)
-    if not (np.any(found.stiffness) or before.on):
+    if not (np.any(found.value.spring) or before.on):
         return
-    new = Springs(found.stiffness.round(4).tolist(), (found.rest + found.turn[:, 0]).round(4).tolist())
-    note = f"Nm/rad, +-{row(found.stiffness_error)}; 0: the poses show none"
+    value = found.value
+    slack = value.turn[:, 0] - value.offset * value.scale / np.where(value.spring > 0.0, value.spring, np.inf)
+    rest = np.clip(slack, -MAX_REST, MAX_REST).round(4)
+    new = Springs(value.spring.round(4).tolist(), rest.tolist())
+    note = f"Nm/rad, +-{row(found.error.spring)}; 0: the poses show none"
     yield Change(node, "joint_spring.stiffness", list(new.stiffness), note)
     yield Change(node, "joint_spring.rest", list(new.rest), "rad, with the offset of the motor")
     bridge = arm.can_bridge
@@ -420,11 +423,11 @@ def _spring_changes(arm: ConfiguredArm, found: Identified) -> Iterator[Change]:
 
 def _lines(arm: ConfiguredArm, found: Identified) -> Iterator[str]:
     """Yield what the parameter file does not hold, in sentences."""
-    for name, slide, offset in zip(arm.joint_names, found.friction, found.offset, strict=True):
+    for name, slide, offset in zip(arm.joint_names, found.friction, found.value.offset, strict=True):
         yield f"{name}: friction {slide:.2f} Nm, offset {offset:+.3f} Nm"
     worst = float(np.nanmax(np.abs(found.held_out), initial=0.0))
     yield f"largest torque error of a pose that was left out: {worst:.3f} Nm"
-    for index, reason in found.rejected:
+    for index, reason in found.rejected.items():
         yield f"pose {index + 1} was not used: {reason}"
     yield from (f"Not shown by these poses: {what}" for what in found.unknown)
 
@@ -449,7 +452,7 @@ def checked(arm: ConfiguredArm, observations: Sequence[Observation]) -> Calibrat
     held, (*_, effort, spread) = _needed(arm, model_of(arm), observations), columns(observations)
     size = np.sqrt(np.mean(held**2, axis=0))
     noise = np.sqrt(np.sum((held * spread) ** 2, axis=0)) / np.maximum(len(held) * size, 1e-9)  # Nm, of this tour
-    error = np.hypot(for_joints(torque_error(arm), len(arm.joint_names), max), noise)
+    error = np.hypot(for_joints(stated_error(arm), len(arm.joint_names), max), noise)
     share = np.sum(held * effort, axis=0) / np.maximum(np.sum(held**2, axis=0), 1e-12)  # of the command that was enough
     band = 100.0 * COVER * error / np.maximum(size, 1e-9)
     now, then = temperatures(observations).mean(axis=0), arm.can_bridge["torque_scale_temperature"]
@@ -466,7 +469,7 @@ def checked(arm: ConfiguredArm, observations: Sequence[Observation]) -> Calibrat
     return CalibrationResult((), tuple(lines), tuple(refusals), arm, observations=tuple(observations))
 
 
-def torque_error(arm: ConfiguredArm) -> Sequence[float]:
+def stated_error(arm: ConfiguredArm) -> Sequence[float]:
     """Return the file's `model_error.torque`, or its default, in Nm."""
     error: Sequence[float] = arm.compensator.get("model_error.torque", ModelError().torque)
     return error
@@ -568,20 +571,21 @@ class WornArm:
 
     def _known(self, mass: np.ndarray, cog: np.ndarray) -> Known:
         """Return what is known, for a wearer of mass (n,) in kg at cog (n,) in m on the links."""
-        at, deviations = layout_of(self.model, 0), []
+        deviations = []
         for link in np.flatnonzero(mass):
             heavier = PRIOR.mass * np.append(1.0, cog[link] * self.model.directions[link])
             of_link = mass[link] * np.vstack((heavier, PRIOR.place * np.eye(4)[1:]))  # mass, and moments along x, y, z
             deviations.append(of_link @ self.model.added(int(link)))
         moments = np.vstack(deviations)
-        covariance = moments.T @ moments + EXACT**2 * np.eye(at.moment.stop)
-        start, least, error = np.zeros(at.total), np.full(at.total, -np.inf), np.full(at.total, EXACT)
-        start[at.moment] = self.model.moments + self.expected
-        least[at.spring] = 0.0
-        error[at.spring], error[at.offset], error[at.moment] = PRIOR.stiffness, PRIOR.middle, PRIOR.moment
-        known = np.zeros((at.moment.stop, at.total))
-        known[:, at.moment] = np.linalg.inv(np.linalg.cholesky(covariance))
-        return Known(start, error, least, known)
+        count = moments.shape[1]
+        covariance = moments.T @ moments + EXACT**2 * np.eye(count)
+        known = known_of(self.model, None, False)
+        known.start[:count] += self.expected
+        known.least[:count], known.error[:] = -np.inf, EXACT
+        error = Unknowns.of(known.error, self.model)
+        error.spring[:], error.offset[:], error.moment[:] = PRIOR.stiffness, PRIOR.middle, PRIOR.moment
+        table = np.pad(np.linalg.inv(np.linalg.cholesky(covariance)), ((0, 0), (0, len(known.start) - count)))
+        return known._replace(product=table)
 
 
 def calibrate_wearer(options: argparse.Namespace, arm: ConfiguredArm, say: Say) -> CalibrationResult:
@@ -605,7 +609,7 @@ def wearer_from(
     not show an arm.
     """
     worn, observations = WornArm(arm), at_links(arm, observations)
-    model, at, count = worn.model, layout_of(worn.model, 0), len(arm.joint_names)
+    model, count = worn.model, len(arm.joint_names)
     theta, direction, effort, spread = columns(observations)
     of_two = itertools.combinations(range(len(theta)), 2)
     visits = [pair for pair in of_two if np.ptp(theta[list(pair)], axis=0).max() < WEARER.same_pose]
@@ -630,9 +634,10 @@ def wearer_from(
     poses = np.random.default_rng(0).uniform(low, high, (WEARER.samples, count))
     new = rows_at(model, poses, np.tile(direction[0], (len(poses), 1)))._replace(theta=poses - middle)
     misfit = np.sqrt(np.maximum(solution.sigma**2 - spread**2, 0.0).mean(axis=0))
-    unsure = held(model, new, solution, misfit, np.zeros(count)).error
-    moments, stiffness = solution.unknowns[at.moment] - model.moments, solution.unknowns[at.spring]
-    rest = middle - np.where(stiffness > 0.0, solution.unknowns[at.offset] / np.maximum(stiffness, EXACT), 0.0)
+    unsure = torque_error(new, solution, misfit)
+    value, error = (Unknowns.of(part, model) for part in (solution.unknowns, solution.error))
+    moments, stiffness = value.moment - model.moments, value.spring
+    rest = middle - np.where(stiffness > 0.0, value.offset / np.maximum(stiffness, EXACT), 0.0)
     compared, refusals = _compared(arm, worn, moments, model.rows(theta, direction), unsure)
     refusals += [
         f"{name}: a spring of {one:.1f} Nm/rad: must be at most {MAX_TISSUE:g}: was the arm touched?"
@@ -651,8 +656,7 @@ def wearer_from(
         f"can_bridge, for this wearer at support 1: largest_moment [{_rounded_up(largest, 2)}] kg m, "
         f"largest_addition {_rounded_up(added, 1)} Nm or more",
     )  # fmt: skip
-    node, errors = f"{arm.namespace}/compensator", solution.error
-    noted = f"kg m, +-{row(errors[at.moment])}"
+    node, noted = f"{arm.namespace}/compensator", f"kg m, +-{row(error.moment)}"
     # Any share up to `carried` is as likely to be held unseen. Two of these errors cover 95 % of them.
     unseen = 0.95 * carried / (1.0 - 0.95 * carried) / COVER
     changes = [
@@ -661,13 +665,13 @@ def wearer_from(
             for name, part in model.worn_in_file(moments).items()
         ),
         *exact_law(arm),
-        Change(node, "wearer.joint_stiffness", stiffness.round(3).tolist(), f"Nm/rad, +-{row(errors[at.spring])}"),
+        Change(node, "wearer.joint_stiffness", stiffness.round(3).tolist(), f"Nm/rad, +-{row(error.spring)}"),
         Change(node, "wearer.joint_rest", rest.round(3).tolist(), "rad"),
         Change(node, "model_error.wearer_torque", unsure.round(3).tolist(), "Nm, of the wearer's passive arm"),
         Change(node, "model_error.wearer", round(unseen, 3), "share that the wearer may have held"),
     ]
     if "model_error.torque" not in arm.compensator:
-        assumed = list(for_joints(torque_error(arm), count, max))
+        assumed = list(for_joints(stated_error(arm), count, max))
         note = "Nm of the robot, assumed: `calibrate gravity` measures it"
         changes.append(Change(node, "model_error.torque", assumed, note))
     return CalibrationResult(tuple(changes), lines, tuple(refusals), arm, observations=tuple(observations))

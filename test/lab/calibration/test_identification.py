@@ -9,7 +9,6 @@ import pytest
 from exo_gravity.core.arm.interface import STANDARD_GRAVITY
 from exo_gravity.core.arm.tilt import SIDES, Tilt, gravity_in_trunk, rotation_matrix
 from exo_gravity.core.errors import DataError
-from exo_gravity.core.numbers import COVER
 from exo_gravity.lab.calibration.identification import Places, identify
 from exo_gravity.lab.calibration.imu import NO_HEADING, turn_in_trunk, turned, with_mounting
 from exo_gravity.lab.calibration.moment_model import MomentModel
@@ -41,7 +40,10 @@ def devices():
 def share_covered(found_of_devices):
     """Return the share of moments and scales that lie within two of their standard errors."""
     size = [
-        np.append((found.moments - device.moments) / found.error, (found.scale - device.scale) / found.scale_error)
+        np.append(
+            (found.value.moment - device.moments) / found.error.moment,
+            (found.value.scale - device.scale) / found.error.scale,
+        )
         for device, found in found_of_devices
     ]
     return np.mean(np.abs(size) < 2.0)
@@ -51,12 +53,12 @@ def test_moments_of_random_devices_and_torques_in_new_poses_are_right_to_2_perce
     theta = np.random.default_rng(7).uniform((-1.0, 0.0, -0.5, 0.0), (1.0, 2.8, 2.0, 2.6), (500, 4))
     for device, found in devices:
         true = device.effort(theta, LEANING)
-        off = PAPERS.rows(theta, LEANING) @ found.moments / found.scale + found.offset - true
+        off = PAPERS.rows(theta, LEANING) @ found.value.moment / found.value.scale + found.value.offset - true
         assert np.all(np.sqrt(np.mean(off**2, axis=0)) < 0.02 * np.abs(true).max(axis=0))
-        wrong = np.abs(found.moments - device.moments)
-        assert np.all((wrong < 2.0 * found.error) | (wrong < 0.02 * device.moments.max()))
+        wrong = np.abs(found.value.moment - device.moments)
+        assert np.all((wrong < 2.0 * found.error.moment) | (wrong < 0.02 * device.moments.max()))
         np.testing.assert_allclose(found.friction, device.friction / device.scale, atol=0.015)
-    share = np.abs([(found.moments - device.moments)[1:4] / device.moments[1:4] for device, found in devices])
+    share = np.abs([(found.value.moment - device.moments)[1:4] / device.moments[1:4] for device, found in devices])
     assert np.median(share) < 0.01 and share.max() < 0.04
     assert 0.90 <= share_covered(devices) <= 0.99
 
@@ -67,9 +69,9 @@ def test_the_prediction_of_a_pose_is_that_of_a_fit_without_it_and_nearly_as_good
         assert np.linalg.norm(found.residual) < np.linalg.norm(found.held_out) < 5.0 * np.linalg.norm(found.residual)
     observations = Device(1).tour()
     found, without = identify(observations, PAPERS), identify(observations[1:], PAPERS)
-    direction, theta = LEANING + np.cross(without.tilt, LEANING), np.array([observations[0].theta])
-    rows = (PAPERS.along_axes(theta) + PAPERS.turned(theta) @ without.turn.ravel())[0] @ direction
-    predicted = rows @ without.moments / without.scale + without.offset
+    direction, theta = LEANING + np.cross(without.value.tilt, LEANING), np.array([observations[0].theta])
+    rows = (PAPERS.along_axes(theta) + PAPERS.turned(theta) @ without.value.turn.ravel())[0] @ direction
+    predicted = rows @ without.value.moment / without.value.scale + without.value.offset
     np.testing.assert_allclose(found.held_out[0], observations[0].effort - predicted, atol=2e-3)
 
 
@@ -79,11 +81,11 @@ def test_without_a_weight_moments_and_scales_are_relative_but_the_commanded_torq
     assert found.relative and "common factor" in found.unknown[0]
     weighed = identify(Device(3).tour(), PAPERS)
     assert not weighed.relative and "common factor" not in weighed.unknown[0]
-    assert np.prod(found.scale[1:]) == pytest.approx(1.0, abs=1e-5)
-    factor = found.moments[1] / device.moments[1]
+    assert np.prod(found.value.scale[1:]) == pytest.approx(1.0, abs=1e-5)
+    factor = found.value.moment[1] / device.moments[1]
     assert factor == pytest.approx(np.prod(device.scale[1:]) ** (-1.0 / 3.0), rel=0.01)
-    np.testing.assert_allclose(found.moments / factor, device.moments, atol=0.004)
-    np.testing.assert_allclose(found.scale / factor, device.scale, rtol=0.03)
+    np.testing.assert_allclose(found.value.moment / factor, device.moments, atol=0.004)
+    np.testing.assert_allclose(found.value.scale / factor, device.scale, rtol=0.03)
 
 
 def test_with_an_upright_stand_joint_1_is_not_known_and_said_to_be_and_of_equal_poses_the_first_is_chosen():
@@ -92,8 +94,8 @@ def test_with_an_upright_stand_joint_1_is_not_known_and_said_to_be_and_of_equal_
     found = identify(device.tour(UPRIGHT), PAPERS)
     assert "M1, W, torque scale 1: joint 1 carries nothing" in found.unknown[0]
     seen = [name not in ("M1", "W") for name in PAPERS.names]
-    assert np.isfinite(found.error).tolist() == seen and np.isinf(found.scale_error[0])
-    assert np.all(np.abs(found.moments - device.moments)[seen] < 4.0 * found.error[seen])
+    assert np.isfinite(found.error.moment).tolist() == seen and np.isinf(found.error.scale[0])
+    assert np.all(np.abs(found.value.moment - device.moments)[seen] < 4.0 * found.error.moment[seen])
 
 
 @pytest.mark.parametrize(
@@ -104,7 +106,10 @@ def test_the_first_moment_is_never_negative_and_its_error_stays_honest(seed, til
     device = Device(seed)
     device.moments[0] = -0.003
     found = identify(device.tour(Tilt.of("right", *tilt).direction), PAPERS)
-    assert 0.0 <= found.moments[0] < device.moments[0] + 2.0 * found.error[0] and found.error[0] >= error
+    assert (
+        0.0 <= found.value.moment[0] < device.moments[0] + 2.0 * found.error.moment[0]
+        and found.error.moment[0] >= error
+    )
 
 
 def test_a_zero_that_is_off_looks_like_a_moment_across_the_link_and_the_torque_is_right_all_the_same():
@@ -112,14 +117,10 @@ def test_a_zero_that_is_off_looks_like_a_moment_across_the_link_and_the_torque_i
     observations = [o._replace(theta=np.subtract(o.theta, off)) for o in device.tour()]
     found = identify(observations, PAPERS)
     turned = np.arctan2(*(device.moments[[7, 3]])) + off[3]
-    assert np.arctan2(found.moments[7], found.moments[3]) + found.turn[3, 0] == pytest.approx(turned, abs=0.02)
+    assert np.arctan2(found.value.moment[7], found.value.moment[3]) + found.value.turn[3, 0] == pytest.approx(
+        turned, abs=0.02
+    )
     assert any("Y4 of link 4 from an error of joint 4's zero" in sentence for sentence in found.unknown)
-
-
-def test_a_weight_shows_an_error_of_joint_3s_zero():
-    observations = [o._replace(theta=np.subtract(o.theta, (0.0, 0.0, 0.05, 0.0))) for o in Device(17).tour()]
-    found, without = identify(observations, PAPERS), identify(Device(17).tour(), PAPERS)
-    assert np.degrees(found.turn[2, 0] - without.turn[2, 0]) == pytest.approx(np.degrees(0.05), abs=1.0)
 
 
 def askew_torque(turn, theta, direction):
@@ -149,38 +150,22 @@ def off_device(seed, model, leans, askew, zero):
             tour.append(Observation(theta, np.array(down), effort, spread, spread))
     found = identify(tour, model)
     new = np.random.default_rng(9).uniform((-0.8, 0.3, -0.2, 0.2), (0.8, 1.3, 1.2, 1.4), (200, 4))
-    mounted = np.array(UPRIGHT) + model.keeps_tilt * np.cross(found.tilt, UPRIGHT)
-    springs = found.stiffness * (new + off - found.rest)
-    moments = np.where(np.isfinite(found.error), found.in_file, model.moments)
-    joints = new + off + found.turn[:, 0]  # as the new zeros show them
-    law = (PAPERS.rows(joints, mounted / np.linalg.norm(mounted)) @ moments + springs) / found.scale
+    mounted = np.array(UPRIGHT) + model.keeps_tilt * np.cross(found.value.tilt, UPRIGHT)
+    rest = found.value.turn[:, 0] - found.value.offset * found.value.scale / np.maximum(found.value.spring, 1e-9)
+    springs = found.value.spring * (new + off - rest)
+    moments = np.where(np.isfinite(found.error.moment), found.value.moment, model.moments)
+    joints = new + off + found.value.turn[:, 0]  # as the new zeros show them
+    law = (PAPERS.rows(joints, mounted / np.linalg.norm(mounted)) @ moments + springs) / found.value.scale
     true = askew_torque(turn, new, UPRIGHT)
     return np.abs(law - true), found, float(np.abs(true).max())
 
 
-TWO_LEANS = LEANING, Tilt.of("right", -0.1, 0.25).direction
-
-
-@pytest.mark.parametrize(
-    ("seeds", "with_imu", "zero", "covered", "error"),
-    [
-        (2, True, 1.5, 0.0, 0.03),
-        pytest.param(6, True, 0.0, 0.9, 0.0, marks=pytest.mark.thorough),
-        pytest.param(6, False, 0.0, 0.9, 0.0, marks=pytest.mark.thorough),
-    ],
-)
-def test_the_band_contains_what_zeros_and_axes_leave_that_are_off_which_is_little(
-    seeds, with_imu, zero, covered, error
-):
-    model, leans = MomentModel(DEFAULT_LINKS, with_imu), TWO_LEANS if with_imu else (UPRIGHT,)
-    inside = []
-    for seed in range(seeds):
-        wrong, found, peak = off_device(seed, model, leans, 1.5, zero)
-        inside.append(wrong < COVER * found.torque_error)
-        if error:
-            assert wrong.max() < 0.02 * peak  # 0.8 and 1.5 %; with zeros and axes held 1.1 and 2.9 %
-        assert np.max(found.torque_error) < (error * peak / COVER if error else 0.1)
-    assert np.mean(inside, axis=(0, 1)).min() >= covered
+def test_zeros_and_axes_that_are_off_leave_little():
+    model, leans = MomentModel(DEFAULT_LINKS, True), (LEANING, Tilt.of("right", -0.1, 0.25).direction)
+    for seed in range(2):
+        wrong, found, peak = off_device(seed, model, leans, 1.5, 1.5)
+        assert wrong.max() < 0.02 * peak  # with zeros held 2.9 %
+        assert np.max(found.torque_error) < 0.015 * peak
 
 
 def with_point(model, link, place):
@@ -204,6 +189,7 @@ def test_what_a_mass_anywhere_on_a_link_adds_to_the_moments_is_pinocchios(link):
 def test_the_papers_derivatives_by_turns_are_pinocchios():
     pin, model = pinocchio_model(DEFAULT_LINKS)
     moments, changed = MomentModel(DEFAULT_LINKS, True), np.zeros(8)
+    moments.fitted_turns = 3
     for link, way in moments.base[4:]:  # W, Z, Y3 and Y4
         with_point(model, link, 0.05 * way)
         changed += np.append(1.0, 0.05 * way) @ moments.added(link)
@@ -231,7 +217,9 @@ def test_friction_that_grows_with_the_torque_widens_the_band():
 
 def test_zeros_of_a_jig_are_kept():
     found = identify(Device(5).tour(), PAPERS, Places(zero=0.0))
-    assert np.abs(found.turn[:, 0]).max() < 1e-4 < np.abs(identify(Device(5).tour(), PAPERS).turn[:, 0]).max()
+    assert (
+        np.abs(found.value.turn[:, 0]).max() < 1e-4 < np.abs(identify(Device(5).tour(), PAPERS).value.turn[:, 0]).max()
+    )
 
 
 def test_the_next_pose_shows_more_than_a_repeated_or_a_random_one():
@@ -239,7 +227,7 @@ def test_the_next_pose_shows_more_than_a_repeated_or_a_random_one():
     device = Device(16)
 
     def uncertain(poses):
-        return np.log(identify([device.observe(theta) for theta in poses], PAPERS).error).sum()
+        return np.log(identify([device.observe(theta) for theta in poses], PAPERS).error.moment).sum()
 
     chosen = uncertain(best(LEANING, 10))
     drawn = [uncertain(rng.permutation(CANDIDATES)[:10]) for _ in range(5)]
@@ -260,16 +248,15 @@ def test_a_pose_with_a_slip_or_a_hand_is_left_out_and_named(slips):
     for index, error in slips.items():
         observations[index] = observations[index]._replace(effort=np.add(observations[index].effort, error))
     found = identify(observations, PAPERS)
-    assert {index: reason.partition(" is ")[0] for index, reason in found.rejected} == {
+    assert {index: reason.partition(" is ")[0] for index, reason in found.rejected.items()} == {
         index: f"effort of joint {int(np.argmax(np.abs(error))) + 1}" for index, error in slips.items()
     }
-    assert np.all(np.abs(found.moments - device.moments) < 4.0 * found.error)
+    assert np.all(np.abs(found.value.moment - device.moments) < 4.0 * found.error.moment)
 
 
 @pytest.mark.parametrize(
     ("bare", "spoilt", "words"),
     [
-        pytest.param(30, 12, r"pose 17: effort of joint 1 is", marks=pytest.mark.thorough),
         (8, 6, "off in half of the poses"),
     ],
 )
@@ -294,7 +281,7 @@ def test_too_few_poses_are_refused_with_the_pose_that_is_missing_and_accepted_wi
             assert "poses do not show" in str(error)
             degrees = str(error).split("add the pose [")[1].split("]")[0].split(",")
             observations.append(device.observe(np.radians([float(angle) for angle in degrees])))
-    assert np.all(np.abs(found.moments[1:4]) > found.error[1:4])
+    assert np.all(np.abs(found.value.moment[1:4]) > found.error.moment[1:4])
 
 
 ARM = configured_arm(packaged_config("sim.yaml"))
@@ -315,9 +302,9 @@ def test_an_imu_that_is_two_degrees_off_does_no_harm_and_is_found(seed):
     measured = leant(np.random.default_rng(seed).normal(size=3), np.radians(2.0))
     observations = [one._replace(direction=measured) for one in device.tour(tuple(DOWN), 8, 8)]
     found = identify(observations, PAPERS)
-    error = np.abs(found.moments - device.moments)
-    assert np.all(error < np.maximum(3.5 * found.error, 0.01 * device.moments.max()))
-    direction = measured + np.cross(found.tilt, measured)
+    error = np.abs(found.value.moment - device.moments)
+    assert np.all(error < np.maximum(3.5 * found.error.moment, 0.01 * device.moments.max()))
+    direction = measured + np.cross(found.value.tilt, measured)
     assert np.linalg.norm(direction / np.linalg.norm(direction) - DOWN) < np.radians(0.3)
 
 
