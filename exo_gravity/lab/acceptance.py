@@ -47,7 +47,8 @@ class BenchAcceptance:
     spread: int = 15  #: K between the coldest and the warmest of motors that rested in one room
     same: float = math.radians(5.0)  #: rad within which an arm hangs again after its supply was off
     silence: float = 0.3  #: s without a reply that show that the supply was off
-    start: float = 20.0  #: s for the checks of a start to pass
+    start: float = 20.0  #: s for the checks of a start to pass,
+    push: float = 2.0  #: and as much more for each joint, which is pushed
     angle: float = math.radians(30.0)  #: rad to which the weight is lifted: enough for its torque, not far to fall
     least: float = 0.3  #: Nm that the last joint must need there: less is lost in friction and resolution
     rise: float = 0.3  #: Nm/s; an arm that is lifted so slowly is in balance all the time
@@ -157,9 +158,11 @@ class Bench:
         if safety.state is State.FAULT:
             self.loop.call(lambda: safety.clear(now()))
         self.loop.call(lambda: safety.enable(now()))
-        if self.until(lambda: safety.state is State.ACTIVE or safety.fault, ACCEPTANCE.start) and not safety.fault:
+        longest = ACCEPTANCE.start + ACCEPTANCE.push * len(self.motors)
+        if self.until(lambda: safety.state is State.ACTIVE or safety.fault, longest) and not safety.fault:
             return ""
-        return safety.fault.reason if safety.fault else safety.refusal or safety.waiting_for
+        why = safety.refusal or safety.waiting_for or f"the start takes longer than {longest:g} s"
+        return safety.fault.reason if safety.fault else why
 
     def lift_weight(self, share: float) -> str:
         """Let the last joint balance the weight with `share` of what holds it at `ACCEPTANCE.angle`, until it is still.

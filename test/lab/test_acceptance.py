@@ -115,7 +115,9 @@ def test_what_is_not_as_the_file_says_fails_at_its_step(case):
     assert failed(results) == step and said in results[-1].sentence
 
 
-def test_a_person_who_breaks_off_is_told_of_motors_that_stay_on():
+def test_a_start_that_takes_too_long_is_none_and_a_person_who_breaks_off_is_told_of_motors_that_stay_on():
+    hangs = {"safety.fault": None, "safety.refusal": "", "safety.waiting_for": ""}  # while it pushes joints
+    assert "takes longer" in Bench.carry(Mock(**{"until.return_value": False}, motors=(), loop=Mock(**hangs)))
     said = Mock()
     with pytest.raises(KeyboardInterrupt):
         accept(Mock(**{"ask.side_effect": KeyboardInterrupt, "until.return_value": False}), said)
