@@ -115,7 +115,10 @@ class NodeParameters:
             return
         if math.isfinite(self._due):  # else they have changed since
             self._due = math.inf
-        values = map(parameter_value_to_python, asked.result().values)
+        try:
+            values = [parameter_value_to_python(value) for value in asked.result().values]
+        except RuntimeError:  # of a type that ROS does not have
+            return
         known = {name: plain(value) for name, value in zip(names, values, strict=False) if value is not None}
         self.values = self._fitting(self._name, known)
         if self._once:
