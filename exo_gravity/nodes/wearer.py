@@ -280,7 +280,7 @@ class WearerNode(Node):
         self._problem = NO_REASON
         if estimate:
             for publisher, values in ((self._efforts, estimate.torque), (self._deviations, estimate.deviation)):
-                statement = JointState(name=self._names, effort=values)
+                statement = JointState(name=self._names, effort=values.tolist())
                 statement.header.stamp = message.header.stamp
                 publisher.publish(statement)
         elif trunk is None:

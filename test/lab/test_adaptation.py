@@ -5,6 +5,7 @@ import math
 from dataclasses import replace
 from typing import Any
 
+import numpy as np
 import pytest
 
 from exo_gravity.core.compensation.support import REQUEST
@@ -29,7 +30,7 @@ class Arm:
     def move(self, speed: float, duration: float, is_known: bool = True) -> float:
         """Move at `speed` rad/s for `duration` s, read as on the device; return the support at the end."""
         deviation, weight = (0.0, self.deviation, 0.0, 0.0), (0.0, WEIGHT, 0.0, 0.0)
-        estimate = WearerEstimate((0.0, self.share * WEIGHT, 0.0, 0.0), deviation, weight, deviation)
+        estimate = WearerEstimate(*map(np.array, ((0.0, self.share * WEIGHT, 0.0, 0.0), deviation, weight, deviation)))
         for _ in range(round(duration / PERIOD)):
             self.now += PERIOD
             self.angle += speed * PERIOD

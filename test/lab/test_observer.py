@@ -230,7 +230,7 @@ def test_an_error_of_the_weight_is_the_same_share_in_every_joint_and_does_not_av
     light = light._replace(deviation=0.12 * np.abs(light.weight))
     assert shares_of(light).whole.deviation == pytest.approx(0.12)
     assert shares_of(light).joints.deviation[1:] == pytest.approx(0.12)
-    running, estimate = SupportAdaptation(), WearerEstimate(*(tuple(column[-1]) for column in light[1:]))
+    running, estimate = SupportAdaptation(), WearerEstimate(*(column[-1] for column in light[1:]))
     for n in range(500):
         running.update(n * PERIOD, (POSE, STILL), estimate, SETTINGS)
     assert running.shares.whole == pytest.approx((0.1, 0.12)) and np.array(running.shares.joints)[
@@ -303,8 +303,8 @@ def touched(torques: list[float], deviation: float = 0.2, gap: float = 0.0) -> C
     watch = ContactWatch()
     for number, torque in enumerate(torques, 1):
         now = PERIOD * number + gap * (number == len(torques))
-        band = (deviation,) * 4
-        watch.update(now, WearerEstimate((0.0, 0.0, 0.0, torque), band, (0.0,) * 4, band))
+        band = np.full(4, deviation)
+        watch.update(now, WearerEstimate(np.array((0.0, 0.0, 0.0, torque)), band, np.zeros(4), band))
     return watch
 
 
