@@ -65,8 +65,7 @@ def acceptance(
     last = arm.motors[-1]
     motors = (*arm.motors[:-1], last if assumed_timeout is None else replace(last, timeout=assumed_timeout))
     person, rate = Person(supply), arm.can_bridge["rate"]
-    lift = Lift(arm.limits, 1.0 / rate)
-    person.arm = played = VirtualArm(device, lift, motors, arm.limits, rate)
+    person.arm = played = VirtualArm(device, Lift(arm.limits, 1.0 / rate), motors, arm.limits, rate)
     bench = Bench(played.loop, motors, model_of(arm), weight, played.run, person.ask)
     results = accept(bench, person.said.append)
     assert not device.powered and len(person.said) == len(results)
@@ -116,8 +115,12 @@ def test_what_is_not_as_the_file_says_fails_at_its_step(case):
 
 
 def test_a_start_that_takes_too_long_is_none_and_a_person_who_breaks_off_is_told_of_motors_that_stay_on():
-    hangs = {"safety.fault": None, "safety.refusal": "", "safety.waiting_for": ""}  # while it pushes joints
-    assert "takes longer" in Bench.carry(Mock(**{"until.return_value": False}, motors=(), loop=Mock(**hangs)))
+    assert "takes longer" in Bench.carry(
+        Mock(
+            **{"loop.safety.fault": None, "loop.safety.refusal": "", "loop.safety.waiting_for": ""},
+            **{"until.return_value": False, "motors": ()},
+        )
+    )
     said = Mock()
     with pytest.raises(KeyboardInterrupt):
         accept(Mock(**{"ask.side_effect": KeyboardInterrupt, "until.return_value": False}), said)

@@ -154,8 +154,14 @@ def test_a_torque_that_rises_steadily_is_followed_without_lag_and_a_gap_starts_a
 def test_each_error_of_the_model_widens_the_band():
     needed = gravity_torque(WHOLE, POSE, TILT.direction).tolist()
     narrow = np.array(still(needed).deviation)
-    errors = {"torque": (0.3,) * 4, "scale": (0.1,) * 4, "wearer": 0.1, "tilt": 0.05, "wearer_torque": (0.3,) * 4}
-    errors["deflection"] = (0.03,) * 4
+    errors = {
+        "torque": (0.3,) * 4,
+        "scale": (0.1,) * 4,
+        "wearer": 0.1,
+        "tilt": 0.05,
+        "wearer_torque": (0.3,) * 4,
+        "deflection": (0.03,) * 4,
+    }
     for name, value in errors.items():
         wider = still(needed, settings=replace(SETTINGS, model_error=replace(EXACT, **{name: value})))
         assert np.all(np.array(wider.deviation) >= narrow) and wider.deviation[1] > 1.05 * narrow[1], name
