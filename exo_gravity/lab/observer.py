@@ -98,8 +98,8 @@ class MomentumObserver:
         columns = coulomb, for_joints(friction.viscous, count), for_joints(friction.load, count)
         self._coulomb, self._viscous, self._load = map(np.array, columns)
         self._inertia = self._links.matrix(for_joints(OBSERVER.reference, count, max))
-        code = 2.0 * OBSERVER.bandwidth * OBSERVER.velocity_code * np.hypot.reduce(self._inertia, axis=1)
-        self._constant = np.hypot.reduce((self._error.torque, self._error.wearer_torque, code))  # Nm
+        code = 2.0 * OBSERVER.bandwidth * OBSERVER.velocity_code * np.linalg.norm(self._inertia, axis=1)
+        self._constant = np.linalg.norm((self._error.torque, self._error.wearer_torque, code), axis=0)  # Nm
         deflection = np.array(for_joints(self._error.deflection, count, max))
         self._bent = np.diag(deflection)[deflection > 0.0]  # rad by which links are off, one link a row
         self._is_elastic = (np.array(s.joint_stiffness) > 0.0) | (deflection > 0.0)
@@ -139,7 +139,7 @@ class MomentumObserver:
         worn = self._gain * self._wearer.torque(theta, still)
         self._felt = low_passed(self._felt, felt, 1.0 - math.exp(-bandwidth * dt))
         shaken = OBSERVER.motion_share * math.dist(felt, self._felt)
-        largest = np.hypot.reduce(columns)  # gravity in any direction
+        largest = np.sqrt(np.square(columns).sum(axis=0))  # gravity in any direction
         leaning = np.maximum(0.0, (tilt.magnitude * largest) ** 2 - gravity**2)
         parts = (
             self._constant,
@@ -152,7 +152,7 @@ class MomentumObserver:
             OBSERVER.inertia_share * bandwidth * (momentum - self._slow),
             OBSERVER.lag_share * lag,
         )
-        independent = np.hypot.reduce(parts)
+        independent = np.sqrt(np.square(parts).sum(axis=0))
         return WearerEstimate(once + lag, np.hypot(independent, self._error.wearer * worn), worn, independent)
 
     def _residual(self, dt: float, momentum: np.ndarray, unexplained: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -184,7 +184,7 @@ class MomentumObserver:
         off = np.maximum(0.0, (velocity - smooth) ** 2 - OBSERVER.least_swing**2)
         self._swing = low_passed(self._swing, off, 1.0 - math.exp(-dt / OBSERVER.swing_time))
         size = np.where(self._is_elastic, *OBSERVER.swing_share) * np.sqrt(self._swing)
-        error = OBSERVER.bandwidth * np.hypot.reduce(self._inertia * size, axis=1)
+        error = OBSERVER.bandwidth * np.sqrt(np.square(self._inertia * size).sum(axis=1))
         return np.where(self._is_elastic, smooth, velocity), error
 
     def _friction(self, velocity: np.ndarray, effort: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
