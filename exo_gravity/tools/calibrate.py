@@ -41,6 +41,7 @@ COMMANDS = {
     "check": ("tours", "whether a few poses still need the torque of the last calibration"),
     "imu": ("imu", "the mounting of the IMU, from standing upright and bowing"),
     ACCEPTANCE: ("", "a record (JSON) of what the first real, unworn arm shows on the bench, step by step"),
+    NEW: ("", "the first parameter file of an arm, from its URDF, its motors and their CAN IDs"),
 }
 
 
@@ -51,19 +52,20 @@ def _arguments(args: Sequence[str] | None) -> argparse.Namespace:
     for name, (_, description) in COMMANDS.items():
         command = commands.add_parser(name, help=description, description=f"calibrate {name}: {description}.")
         option = command.add_argument
-        option("--params", required=True, type=Path, metavar="FILE", help="ROS 2 parameter file of the device")
         option("--output", required=True, type=Path, metavar="NEW.yaml", help="new file to write")
+        if name != NEW:
+            option("--params", required=True, type=Path, metavar="FILE", help="ROS 2 parameter file of the device")
         if name != "imu":
             option("--side", choices=SIDES, default="right", help="which arm (default: %(default)s)")
-        if name == ACCEPTANCE:
-            option("--mass", type=float, required=True, metavar="KG", help="of the weight that is lifted")
+        if name in (ACCEPTANCE, "scale"):
+            option("--mass", type=float, required=True, metavar="KG", help="of the weight")
             option("--lever", type=float, required=True, metavar="M", help="from the last joint to the weight")
-        elif name == "motors":
+        if name == "motors":
             option(
                 "--pose", type=float, nargs="+", default=(), metavar="DEG",
                 help="joint angles at which zero is measured, if the arm is in a jig (default: home, it hangs)",
             )  # fmt: skip
-        else:
+        elif name not in (ACCEPTANCE, NEW):
             option("--bag", type=Path, metavar="FOLDER", help="use this recording instead of the device")
         if name == "imu":
             option("--rests", type=Path, metavar="FOLDER", help="recording of the IMU resting on each of its six sides")
@@ -89,22 +91,15 @@ def _arguments(args: Sequence[str] | None) -> argparse.Namespace:
                 help="assumed standard error of each joint's axis in each direction across it, by CAD or "
                 "brackets (0.6); of an arm from a URDF",
             )  # fmt: skip
-        if name == "scale":
-            option("--mass", type=float, required=True, metavar="KG", help="of the weight")
-            option("--lever", type=float, required=True, metavar="M", help="from the last joint to the weight")
-    what = "the first parameter file of an arm, from its URDF, its motors and their CAN IDs"
-    new = commands.add_parser(NEW, help=f"writes {what}", description=f"calibrate {NEW}: writes {what}.")
-    option = new.add_argument
+    option = commands.choices[NEW].add_argument
     option("--urdf", required=True, metavar="FILE", help="description of the arm, or package://NAME/PATH")
     option("--motors", required=True, nargs="+", metavar="TYPE", help="of each joint, as AK80-64")
     option("--ids", required=True, nargs="+", type=int, metavar="ID", help="CAN ID of each motor")
     option("--joints", nargs="+", default=(), metavar="NAME", help="in this order (default: all turning ones)")
     option("--hand", default="", metavar="LINK", help="link of the URDF that holds a load")
-    option("--side", choices=SIDES, default="right", help="which arm (default: %(default)s)")
     option("--channel", default="can0", metavar="BUS", help="SocketCAN interface (default: %(default)s)")
     option("--fd", action="store_true", help="the bus is CAN FD")
     option("--simulate", action="store_true", help="with a simulated device, on a simulated bus: to try it")
-    option("--output", required=True, type=Path, metavar="NEW.yaml", help="new file to write")
     return parser.parse_args(args)
 
 
