@@ -6,10 +6,10 @@ The commanded effort that holds the arm in a pose is, without friction, which av
     effort = (torque(moments + load) + spring theta) / scale + offset
 
 where torque is the arm's regressor (moment_model.py) times its moments, in kg m. One weighted least squares (`solve`)
-fits all of it: moments, the logarithm of the scales, offsets in Nm, the angles by which a known weight seems to lie
-beside its link, the rotation of gravity's direction from the measured to the true one (an IMU is mounted, and a stand
-placed, to no better than a degree), a spring across each joint in Nm/rad (where it is slack is part of the offset), the
-slope of each scale over the motor's temperature, and small turns of the joints' places.
+fits all of it: moments, the logarithm of the scales, offsets in Nm, the rotation of gravity's direction from the
+measured to the true one (an IMU is mounted to no better than a degree), a spring across each joint in Nm/rad (where it
+is slack is part of the offset), the slope of each scale over the motor's temperature, and small turns of the joints'
+places.
 
 Each unknown is known before, with a standard error: the moments as the file has them, the others as 0. What the poses
 do not show of it stays within that, and is part of the errors. A spring stays where it stands out of its error, and a
@@ -72,7 +72,6 @@ class Fit:
     moment: float = 0.02  #: kg m, in addition: off-axis moments of which the file knows nothing
     scale: float = 0.3  #: of a torque scale; users report 0.75
     offset: float = 0.3  #: Nm
-    beside: float = 0.05  #: rad, of the direction in which a known weight hangs from its joint; 3 degrees
     #: rad about each axis, of gravity's measured direction: an IMU's mounting, mostly its heading
     tilt: float = 0.05
     spring: float = 0.09  #: Nm/rad: cables of up to 0.15
@@ -114,7 +113,6 @@ class Unknowns(NamedTuple):
     moment: np.ndarray  #: (k,) kg m
     scale: np.ndarray  #: (n,), logarithms
     offset: np.ndarray  #: (n,) Nm
-    angle: np.ndarray  #: (2,) rad
     tilt: np.ndarray  #: (3,) rad, the rotation vector of gravity in the base frame
     spring: np.ndarray  #: (n,) Nm/rad
     slope: np.ndarray  #: (n,) 1/K, of the torque scale over the motor's temperature
@@ -125,7 +123,7 @@ class Unknowns(NamedTuple):
     def of(cls, vector: np.ndarray, model: MomentModel) -> "Unknowns":
         """Return the parts of a vector (count,)."""
         n = model.count
-        *parts, turn = np.split(vector, np.cumsum((len(model.names), n, n, 2, 3, n, n)))
+        *parts, turn = np.split(vector, np.cumsum((len(model.names), n, n, 3, n, n)))
         return cls._make((*parts, turn.reshape(n, -1)))
 
 
@@ -144,13 +142,13 @@ def known_of(model: MomentModel, places: Places | None, is_relative: bool) -> Kn
     places: how exactly those of its joints are known; None where these are not fitted.
     is_relative: without a weight a common factor does not show, which is then 1.
     """
-    count = len(model.names) + (4 + model.fitted_turns * bool(places)) * model.count + 5
+    count = len(model.names) + (4 + model.fitted_turns * bool(places)) * model.count + 3
     start, least, error, product = np.zeros(count), np.full(count, -np.inf), np.zeros(count), np.zeros((1, count))
     errors = Unknowns.of(error, model)
     start[: len(model.names)] = model.moments
     Unknowns.of(least, model).spring[:] = least[list(model.at_least_0)] = 0.0
     errors.moment[:] = FIT.share * np.abs(model.moments) + FIT.moment
-    errors.scale[:], errors.offset[:], errors.angle[:] = FIT.scale, FIT.offset, FIT.beside
+    errors.scale[:], errors.offset[:] = FIT.scale, FIT.offset
     errors.tilt[:], errors.spring[:], errors.slope[:] = FIT.tilt, FIT.spring, FIT.slope
     errors.turn[:, :1], errors.turn[:, 1:] = places or AS_USUAL
     # The whole arm turns with its first joint, which is the same as gravity turned.
@@ -169,7 +167,6 @@ class Rows(NamedTuple):
     warmth: np.ndarray  #: (m, n) K of the motors, beyond the mean of their poses; 0 where it is not known
     direction: np.ndarray  #: (m, 3), gravity's unit vector in the base frame, as measured
     load: np.ndarray  #: (m, k) kg m, moments of the weight
-    beside: np.ndarray  #: (m, k, 2) kg m per rad, derivative of these moments by the angles of the weight
 
     def only(self, keep: np.ndarray) -> "Rows":
         """Return the poses that `keep` (m,) selects."""
@@ -192,7 +189,6 @@ class Rows(NamedTuple):
             rows * given[..., None],
             -own * effort[..., None],
             np.broadcast_to(own, (*effort.shape, own.shape[-1])),
-            rows @ self.beside * given[..., None],
             tilted * given[..., None],
             own * (self.theta * given)[..., None],
             -own * (effort * self.warmth / (1.0 + value.slope * self.warmth))[..., None],
@@ -208,7 +204,7 @@ class Rows(NamedTuple):
         value = Unknowns.of(unknowns, self.model)
         direction = self.direction + self.direction @ (value.tilt @ TURN)
         rows = np.einsum("mnka,ma->mnk", self.along + self.turned @ value.turn.ravel(), direction)
-        moments = value.moment + self.load + self.beside @ value.angle
+        moments = value.moment + self.load
         torque = np.einsum("mnk,mk->mn", rows, moments) + value.spring * self.theta
         return rows, moments, torque, np.exp(-value.scale) / (1.0 + value.slope * self.warmth)
 
@@ -218,10 +214,9 @@ def rows_at(model: MomentModel, theta: np.ndarray, direction: Vector, turned: np
 
     direction: (3,) or (m, 3). turned: (m, n, k, 3, t), the derivative by turns, without which none is fitted.
     """
-    load = np.zeros((len(theta), len(model.names)))
-    down, beside = np.broadcast_to(direction, (len(theta), 3)), np.zeros((*load.shape, 2))
+    load, down = np.zeros((len(theta), len(model.names))), np.broadcast_to(direction, (len(theta), 3))
     turned = np.zeros((*theta.shape, len(model.names), 3, 0)) if turned is None else turned
-    return Rows(model, model.along_axes(theta), turned, theta, 0.0 * theta, down, load, beside)
+    return Rows(model, model.along_axes(theta), turned, theta, 0.0 * theta, down, load)
 
 
 class Solution(NamedTuple):
@@ -333,7 +328,7 @@ def next_pose(
     k, n = len(model.names), model.count
     error = np.repeat((SHOWS.moment, SHOWS.other), (k, 2 * n))
     rows = rows_at(model, np.vstack((candidates, *taken)), direction)
-    unknowns = np.append(moments, np.zeros(4 * n + 5))
+    unknowns = np.append(moments, np.zeros(4 * n + 3))
     noise = np.hypot(SHOWS.noise, SHOWS.noise_share * rows.predicted(unknowns))
     shown = rows.jacobian(unknowns)[..., : k + 2 * n] * error / noise[..., None]
     new, seen = shown[: len(candidates)], shown[len(candidates) :].reshape(-1, k + 2 * n)
@@ -426,11 +421,10 @@ def identify(observations: Sequence[Observation], model: MomentModel, places: Pl
     Raises DataError if the result would be unphysical, naming the missing pose, and if an observation is impossible.
     """
     theta, down, effort, spread = columns(observations)
-    weights = [(one.load_mass, one.load_lever) for one in observations]
-    load, beside = (np.array([of(*weight) for weight in weights]) for of in (model.load, model.load_beside))
+    load = np.array([model.load(one.load_mass, one.load_lever) for one in observations])
     temperature, is_relative = temperatures(observations), not np.any(load)
     warmth = np.nan_to_num(temperature - temperature.mean(axis=0))
-    rows = rows_at(model, theta, down, model.turned(theta))._replace(warmth=warmth, load=load, beside=beside)
+    rows = rows_at(model, theta, down, model.turned(theta))._replace(warmth=warmth, load=load)
     known = known_of(model, places, is_relative)
     before = Unknowns.of(known.error, model)
     before.slope[np.ptp(warmth, axis=0) < FIT.least_warming] = EXACT
@@ -467,7 +461,7 @@ def identify(observations: Sequence[Observation], model: MomentModel, places: Pl
     new = new_poses(model)
     unequal = UNEQUAL * grows * new.predicted(solution.unknowns)
     misfit = np.sqrt(np.maximum(solution.sigma**2 - spread[keep] ** 2, 0.0).mean(axis=0))
-    tilt = slice(sum(map(len, value[:4])), sum(map(len, value[:5])))
+    tilt = slice(sum(map(len, value[:3])), sum(map(len, value[:4])))
     residual = effort - rows.predicted(solution.unknowns)
     held_out = residual.copy()
     held_out[keep] = solution.held_out

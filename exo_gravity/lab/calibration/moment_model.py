@@ -115,35 +115,14 @@ class MomentModel:
         """The joints whose torque scales have a product of 1 without a weight: those that carry something upright."""
         return np.flatnonzero(self.upright.any(axis=1))
 
-    def added(self, link: int) -> np.ndarray:
-        """Return what 1 kg in the joint of a link, and 1 kg m on it along x, y, z, add to the moments, (4, k)."""
-        each = np.eye(self.count)[link]
-        mass = self.moments_of(self.arm.with_wearer(each, 0.0 * each)) - self.moments
-        return np.vstack((mass, self._by_link(link)))
-
-    def _by_link(self, link: int) -> np.ndarray:
-        """Return what 1 kg m of a link along each axis of its frame adds to the moments, (3, k)."""
-        shown = ((0, 8, 4), (1, 4, 5), (2, 6, 5), (3, 7, 5))[link]  # 8: no moment, along the axis of joint 1
-        return np.eye(len(self.names) + 1)[list(shown), :-1]
-
-    @cached_property
-    def _on_last(self) -> np.ndarray:
-        return self.added(self.count - 1)
-
     def load(self, mass: float, lever: float) -> np.ndarray:
         """Return the moments (k,) of `mass` kg on the last link, `lever` m from its joint. Raises ParameterError."""
         mass = one_float("load_mass", mass, 0.0, MAX_MASS, "kg")
         lever = one_float("load_lever", lever, 0.0, MAX_LENGTH, "m")
         if not mass:
             return np.zeros(len(self.names))
-        return np.asarray(mass * np.append(1.0, lever * self.directions[-1]) @ self._on_last)
-
-    def load_beside(self, mass: float, lever: float) -> np.ndarray:
-        """Return the change (k, 2) of these moments with the weight in the two directions across its link."""
-        if not mass:
-            return np.zeros((len(self.names), 2))
-        across = np.linalg.svd(self.directions[-1:])[2][1:]
-        return np.asarray(mass * lever * (across @ self._on_last[1:]).T)
+        last = np.eye(self.count)[-1]
+        return np.asarray(self.moments_of(self.arm.with_wearer(mass * last, lever * last)) - self.moments)
 
     def turned(self, theta: np.ndarray) -> np.ndarray:
         """Return the derivative (m, n, k, 3, t) of `along_axes` by `fitted_turns` of each joint's place.
@@ -247,11 +226,6 @@ class DescribedModel(MomentModel):
         poses, down = _sampled(self.count)
         rows = self.rows(poses, down).reshape(-1, len(self.base))
         return np.asarray(np.linalg.lstsq(rows, _needed(arm, poses, down).ravel(), rcond=None)[0])
-
-    def _by_link(self, link: int) -> np.ndarray:
-        """Return the same. Raises ParameterError if the link has no mass in the URDF."""
-        ways = [np.outer(np.eye(self.count)[link], way) for way in np.eye(3)]
-        return np.array([self.moments_of(self.arm.with_wearer_moments(way)) - self.moments for way in ways])
 
     def found(self, arm: UrdfArm, moments: np.ndarray, turn: np.ndarray) -> UrdfArm:
         """Return `arm` with these `moments` (k,) kg m and `turn` (n, 3) rad of the joints' axes, as a fit found them.

@@ -92,8 +92,7 @@ class TorqueGuess:
         self.model, self._load = model, load
         known = known_of(model, None, False)
         error = Unknowns.of(known.error, model)
-        for part in (error.angle, error.tilt, error.slope):
-            part[:] = EXACT
+        error.tilt[:] = error.slope[:] = EXACT
         self._unknowns, self._covariance = known.start, np.diag(known.error**2)
         if seen:
             theta, direction, effort, spread = columns(seen)

@@ -50,7 +50,6 @@ from exo_gravity.lab.calibration.identification import (
     AS_USUAL,
     EXACT,
     Identified,
-    Known,
     Places,
     Unknowns,
     columns,
@@ -521,9 +520,8 @@ class WearerTour:
 class WearerPrior:
     """What is known of a person's relaxed arm before a pose is measured, as standard errors, and what is plausible."""
 
-    mass: float = 0.5  #: share of the table's mass of a segment
-    moment: float = 10.0  #: kg m, of a moment by itself: so wide that only the segments' masses and places tell
-    place: float = 0.05  #: m, of a segment's centre of gravity in each direction
+    share: float = 0.5  #: of a moment by the table: masses and places of segments
+    moment: float = 0.03  #: kg m, in addition: 1.5 kg that lie 2 cm beside their link
     stiffness: float = 1.5  #: Nm/rad, of a relaxed shoulder or elbow
     middle: float = 1.0  #: Nm, of its torque in the middle of the poses
     breathing: float = 0.1  #: Nm: standard deviation by which a relaxed, breathing person differs from pose to pose
@@ -531,7 +529,7 @@ class WearerPrior:
     judged: float = 0.2  #: of the largest torque by the table, from which a joint's is compared with it
     largest_error: float = 0.25  #: of that torque
     table_ratio: tuple[float, float] = (0.6, 1.6)  #: measured to tabled torque that is plausible
-    share: float = 0.6  #: of the way from `home` to a limit of a joint of which no comfortable range is known
+    of_range: float = 0.6  #: of the way from `home` to a limit of a joint of which no comfortable range is known
     reach: tuple[float, float] = (0.2, 1.2)  #: rad, least and most of that way
 
 
@@ -564,28 +562,15 @@ class WornArm:
         mass, cog = (np.array(part) for part in wearer_of({**values, **assumed}, robot.length))
         self.changes = {"tour.wearer_mass": mass.tolist(), "tour.wearer_cog": cog.tolist()}
         self.expected = model.moments_of(robot.with_wearer(mass, cog)) - model.moments
-        self.known = self._known(mass, cog)
+        self.known = known_of(model, None, False)
+        error, count = Unknowns.of(self.known.error, model), len(self.expected)
+        self.known.start[:count] += self.expected
+        self.known.least[:count], self.known.error[:] = -np.inf, EXACT
+        error.spring[:], error.offset[:] = PRIOR.stiffness, PRIOR.middle
+        error.moment[:] = PRIOR.share * np.abs(self.expected) + PRIOR.moment
         home, low, high = np.array(arm.limits.home), arm.low, arm.high
-        down, up = (np.clip(PRIOR.share * way, *PRIOR.reach) for way in (home - low, high - home))
+        down, up = (np.clip(PRIOR.of_range * way, *PRIOR.reach) for way in (home - low, high - home))
         self.comfortable = np.array(model.comfortable or (np.maximum(low, home - down), np.minimum(high, home + up)))
-
-    def _known(self, mass: np.ndarray, cog: np.ndarray) -> Known:
-        """Return what is known, for a wearer of mass (n,) in kg at cog (n,) in m on the links."""
-        deviations = []
-        for link in np.flatnonzero(mass):
-            heavier = PRIOR.mass * np.append(1.0, cog[link] * self.model.directions[link])
-            of_link = mass[link] * np.vstack((heavier, PRIOR.place * np.eye(4)[1:]))  # mass, and moments along x, y, z
-            deviations.append(of_link @ self.model.added(int(link)))
-        moments = np.vstack(deviations)
-        count = moments.shape[1]
-        covariance = moments.T @ moments + EXACT**2 * np.eye(count)
-        known = known_of(self.model, None, False)
-        known.start[:count] += self.expected
-        known.least[:count], known.error[:] = -np.inf, EXACT
-        error = Unknowns.of(known.error, self.model)
-        error.spring[:], error.offset[:], error.moment[:] = PRIOR.stiffness, PRIOR.middle, PRIOR.moment
-        table = np.pad(np.linalg.inv(np.linalg.cholesky(covariance)), ((0, 0), (0, len(known.start) - count)))
-        return known._replace(product=table)
 
 
 def calibrate_wearer(options: argparse.Namespace, arm: ConfiguredArm, say: Say) -> CalibrationResult:
@@ -670,10 +655,6 @@ def wearer_from(
         Change(node, "model_error.wearer_torque", unsure.round(3).tolist(), "Nm, of the wearer's passive arm"),
         Change(node, "model_error.wearer", round(unseen, 3), "share that the wearer may have held"),
     ]
-    if "model_error.torque" not in arm.compensator:
-        assumed = list(for_joints(stated_error(arm), count, max))
-        note = "Nm of the robot, assumed: `calibrate gravity` measures it"
-        changes.append(Change(node, "model_error.torque", assumed, note))
     return CalibrationResult(tuple(changes), lines, tuple(refusals), arm, observations=tuple(observations))
 
 

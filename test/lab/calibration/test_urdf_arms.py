@@ -197,21 +197,6 @@ def test_the_derivatives_by_turns_of_the_joints_are_mujocos(count: int) -> None:
         assert np.abs(wrong).max() < 1e-5
 
 
-def test_a_weight_that_hangs_a_little_beside_its_link_is_no_error_of_a_zero(tmp_path: Path) -> None:
-    bench, lever = Bench.of("three_joints", tmp_path), 0.2
-    hung = np.radians((0.0, 0.0, 3.0))  # the weight is farther round the elbow than said
-    bare, right = bench.observed(np.ones(3)), np.ones(3)
-    truth, none = bench.true_arm((1.0, lever)), bench.true_arm()
-    weighed = []
-    for one in bench.observed(right, (1.0, lever)):
-        theta = np.asarray(one.theta)
-        beside = none.torque(theta) + truth.torque(theta + hung) - none.torque(theta + hung)
-        weighed.append(one._replace(effort=beside))
-    found = identify([*bare, *weighed], model_of(bench.arm))
-    assert np.degrees(np.abs(found.value.turn[:, 0])).max() < 1.0
-    assert np.abs(found.value.scale - 1.0).max() < 0.01
-
-
 def test_two_leans_of_the_base_show_how_the_imu_is_mounted(tmp_path: Path) -> None:
     bench, turn = Bench.of("three_joints", tmp_path), np.array((0.03, -0.03, 0.04))
     arm = replace(bench.arm, compensator={**bench.arm.compensator, "use_imu": True})
