@@ -122,7 +122,7 @@ class Simulator(Node):
             state = TrunkState(device.pitch, device.roll, bow / self._trunk_period, lean / self._trunk_period)
         if self._imu_publisher:
             time = self.get_clock().now().nanoseconds * 1e-9
-            sample = ImuSample(time, *(vector.tolist() for vector in self._imu.sample(state)))
+            sample = ImuSample(time, *self._imu.sample(state).tolist())
             self._imu_publisher.publish(message_of(sample))
 
     def _follow_wearer(self) -> None:

@@ -247,8 +247,7 @@ class SimulatedDevice:
 
     def exchange(self, can_id: int, data: bytes) -> Frame | None:
         """Pass the frame `data` with arbitration ID `can_id` to the motors; return (ID, data) of the reply, if any."""
-        replies = self.replies(can_id, data)
-        return replies[0][1] if replies else None
+        return next((reply for _, reply in self.replies(can_id, data)), None)
 
     def replies(self, can_id: int, data: bytes, among: Collection[int] | None = None) -> list[tuple[int, Frame]]:
         """Pass a frame to the motors that obey its ID; return those that reply, each with (ID, data).

@@ -167,7 +167,6 @@ def _in_trunk(level: Floats3, pitch: float, roll: float) -> Floats3:
 
 
 AVERAGED_SAMPLES = 100  # of one measured tilt
-Sample = tuple[np.ndarray, np.ndarray]  # angular velocity (3,) rad/s and acceleration (3,) m/s^2, in the IMU's axes
 
 
 @dataclass(frozen=True)
@@ -223,8 +222,8 @@ class SimulatedImu:
         # True readings, the newest last: as many as the delay spans.
         self._past: deque[np.ndarray] = deque(maxlen=math.ceil(config.delay * config.rate) + 1)
 
-    def sample(self, state: TrunkState) -> Sample:
-        """Return angular velocity (3,) in rad/s and acceleration (3,) in m/s^2, both in the IMU's axes."""
+    def sample(self, state: TrunkState) -> np.ndarray:
+        """Return angular velocity in rad/s and acceleration in m/s^2, (2, 3), both in the IMU's axes."""
         self._past.append(self._readings(state))
         # Those `delay` s ago, interpolated; the oldest until that time has passed.
         back = min(self.config.delay * self.config.rate, len(self._past) - 1.0)
@@ -234,8 +233,7 @@ class SimulatedImu:
             seen = seen + (back - whole) * (self._past[-2 - whole] - seen)
         self._bias += self._errors(*self._walk)
         readings = seen + self._bias + self._errors(*self._noise)
-        angular_velocity, acceleration = np.clip(readings, -self._range, self._range)
-        return angular_velocity, acceleration
+        return np.clip(readings, -self._range, self._range)
 
     def _readings(self, state: TrunkState) -> np.ndarray:
         """Return the true readings, (2, 3)."""

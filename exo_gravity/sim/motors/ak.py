@@ -386,7 +386,9 @@ class SimulatedMotor:
         joint, readings = self.joint, self._readings(position, velocity)
         temperature = round(max(-40.0, min(215.0, self.temperature)))
         length = self.firmware.reply_length if joint.wire_format.replies else _FULL_LENGTH
-        extra = (temperature, self._error_byte) if length == _FULL_LENGTH else (None, None)
+        is_masked = self.firmware.error_is_mask  # else it is a code, and the motor has not shut off by itself
+        error = self.error | WARM * (is_masked and self.temperature > WARM_ABOVE) | SHUT_OFF * self._is_shut_off
+        extra = (temperature, error) if length == _FULL_LENGTH else (None, None)
         reply = joint.wire_format.pack_reply(self._reported, MotorReply(joint.can_id, *readings, *extra), self.entered)
         return reply + bytes((_BUS_VOLTAGE,)) if length == _FULL_LENGTH - 1 else reply
 
@@ -401,11 +403,6 @@ class SimulatedMotor:
             clamp(joint.direction * velocity, spec.velocity_range),
             clamp(torque, spec.torque_range),
         )
-
-    @property
-    def _error_byte(self) -> int:
-        is_masked = self.firmware.error_is_mask  # else it is a code, and the motor has not shut off by itself
-        return self.error | WARM * (is_masked and self.temperature > WARM_ABOVE) | SHUT_OFF * self._is_shut_off
 
 
 def own_ids(joint: JointMotor, firmware: Firmware) -> dict[int, int]:
