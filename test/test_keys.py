@@ -1,8 +1,6 @@
 # Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
 """What programs read: docs/keys.md has every word of the code and no other, and nothing of ours parses a sentence."""
 
-import copy
-import pickle
 import re
 from collections.abc import Iterable
 from pathlib import Path
@@ -12,7 +10,7 @@ import pytest
 from exo_gravity.core import vocabulary
 from exo_gravity.core.safety.command import FaultCode, State
 from exo_gravity.core.safety.start import TRANSIENT_FAULTS
-from exo_gravity.core.vocabulary import NONE, Reason, Word
+from exo_gravity.core.vocabulary import NONE, Status, Word
 from exo_gravity.lab import vocabulary as of_lab
 
 from .support.keys import documented, row_of
@@ -97,8 +95,6 @@ def test_no_module_and_no_script_of_the_page_searches_a_sentence() -> None:
     assert SEARCHED.search('status.message.startswith("fault")')  # would be found
 
 
-def test_a_reason_is_its_sentence_and_keeps_its_word_when_it_is_copied() -> None:
-    reason = Reason(vocabulary.Wait.REST, "the arm to be at rest")
-    for same in (reason, copy.deepcopy(reason), pickle.loads(pickle.dumps(reason))):
-        assert (same, same.word, f"{same}!") == ("the arm to be at rest", "rest", "the arm to be at rest!")
-    assert not vocabulary.NO_REASON and vocabulary.NO_REASON.word == NONE
+def test_a_status_is_written_as_its_sentence_and_is_false_without_one() -> None:
+    assert f"{Status(vocabulary.Wait.REST, 'the arm to be at rest')}!" == "the arm to be at rest!"
+    assert not vocabulary.NO_REASON and vocabulary.NO_REASON.code == NONE

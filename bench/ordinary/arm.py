@@ -183,7 +183,7 @@ class OrdinaryArm(Rig):
                 self.safety.disable(self.now)
         else:
             fault = self.safety.fault
-            self.result.refused_starts.append(": ".join(fault[:2]) if fault else self.safety.waiting_for)
+            self.result.refused_starts.append(": ".join(fault[:2]) if fault else self.safety.waiting_for.text)
         self.run_until(lambda: self.state in (State.DISABLED, State.FAULT), START)
         self.check_controller()
 

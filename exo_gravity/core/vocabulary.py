@@ -2,11 +2,12 @@
 """The words that programs read on /diagnostics, beside the sentences for people: docs/keys.md.
 
 Each word stands once: the states and the fault codes of an arm in core/safety/command.py, those of nodes off the path
-in lab/vocabulary.py, all others here. A `Reason` is a sentence together with its word, so that what decides on a torque
+in lab/vocabulary.py, all others here. A `Status` has a word and its sentence: what decides on a torque
 tells both at once.
 """
 
 from enum import Enum
+from typing import NamedTuple
 
 INTERFACE = 1  # the version of the keys and words: docs/topics.md
 NONE, UNKNOWN = "none", "unknown"  # nothing to tell; something that the node does not know
@@ -20,23 +21,20 @@ class Word(str, Enum):
         return str(self.value)
 
 
-class Reason(str):
-    """A sentence for people, and its word for programs. It is false where there is nothing to tell."""
+class Status(NamedTuple):
+    """What there is to tell; false where that is nothing. As text it is its sentence."""
 
-    word: str
+    code: str  #: for programs
+    text: str  #: for people, a sentence
 
-    def __new__(cls, word: str, sentence: str) -> "Reason":
-        """Create a reason from its word and its sentence."""
-        reason = super().__new__(cls, sentence)
-        reason.word = str(word)
-        return reason
+    def __bool__(self) -> bool:
+        return bool(self.text)
 
-    def __getnewargs__(self) -> tuple[str, str]:  # type: ignore[override]
-        """Return what a copy is made of."""
-        return self.word, str(self)
+    def __str__(self) -> str:
+        return self.text
 
 
-NO_REASON = Reason(NONE, "")
+NO_REASON = Status(NONE, "")
 
 
 # can_bridge

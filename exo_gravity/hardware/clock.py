@@ -69,7 +69,7 @@ def raise_priority(priority: int) -> None:
         Path("/proc/self/autogroup").write_text(f"{-priority}")
 
 
-def request_real_time(priority: int, log: Callable[[str], object]) -> None:
+def set_realtime_priority(priority: int, log: Callable[[str], object]) -> None:
     """Request real-time scheduling and locked memory; log a sentence for each request that is not permitted.
 
     An option, off by default. A SCHED_FIFO thread runs at once, whatever else is ready; but while other threads wait

@@ -25,7 +25,7 @@ from exo_gravity.core.safety.command import CARRYING, NO_EFFORTS, Command, Effor
 from exo_gravity.core.safety.limits import DAMPING, Limits
 from exo_gravity.core.safety.machine import SafetyMachine
 from exo_gravity.core.safety.watch import RestTracker
-from exo_gravity.core.vocabulary import NO_REASON, Reason, Wait
+from exo_gravity.core.vocabulary import NO_REASON, Status, Wait
 from exo_gravity.hardware.motor_bus import MotorBus
 
 EFFORT_WAIT = 0.5  # share of a cycle's idle time for which the loop may wait for late efforts
@@ -233,7 +233,7 @@ class ControlLoop:
             self.safety.disable(now)
         if self.safety.state is State.CHECKING:
             boards = self.bus.boards.setup_error(now, 1.0 / self.period)
-            self.safety.setup_error = self.setup_error or (Reason(Wait.BOARD_SETUP, boards) if boards else NO_REASON)
+            self.safety.setup_error = self.setup_error or (Status(Wait.BOARD_SETUP, boards) if boards else NO_REASON)
         command = self._command = self.safety.step(now, tuple(self.bus.samples), efforts)
         try:
             complete = self.bus.exchange(command, now + REPLY_SHARE * self.period)

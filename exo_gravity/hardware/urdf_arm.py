@@ -92,7 +92,7 @@ def arm_in_file(values: Mapping[str, Any], why: str) -> UrdfArm | None:
 
 
 @dataclass(frozen=True)
-class Held:
+class Carried:
     """What an arm of n joints holds: a load in its hand, and a wearer's arm on its links.
 
     Both are points of mass. A wearer's segment lies on the line from its link's joint to the next joint, or from the
@@ -172,7 +172,7 @@ class UrdfArm(UrdfShape):
         super().__init__(text, joint_names, hand)
         names = self.names
         self.gain, self.gravity = np.ones(len(names)), STANDARD_GRAVITY
-        self._held = Held()
+        self._held = Carried()
         self._rotors = tuple(rotors) or (0.0,) * len(names)
         self.change = np.zeros((len(names), 3))  #: (n, 3) kg m, by what `corrected` changed the moments
         self.turn = np.zeros((len(names), 3))  #: (n, 3) rad, by what `turned` turned the joints' places
@@ -331,7 +331,7 @@ class UrdfArm(UrdfShape):
         for joint in range(bare.njoints):
             bare.inertias[joint] = self._pin.Inertia.Zero()
         arm = self.scaled(np.ones(len(self.gain)).tolist(), gravity)
-        return arm._with(_bare=bare, _own_mass=0.0, _held=Held())
+        return arm._with(_bare=bare, _own_mass=0.0, _held=Carried())
 
     def with_payload(self, mass: float, cog: Vector = ZERO) -> UrdfArm:
         """Return this arm with a load of `mass` kg in its hand, instead of any other. Raises ParameterError.

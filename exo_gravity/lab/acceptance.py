@@ -161,7 +161,7 @@ class Bench:
         longest = ACCEPTANCE.start + ACCEPTANCE.push * len(self.motors)
         if self.until(lambda: safety.state is State.ACTIVE or safety.fault, longest) and not safety.fault:
             return ""
-        why = safety.refusal or safety.waiting_for or f"the start takes longer than {longest:g} s"
+        why = (safety.refusal or safety.waiting_for).text or f"the start takes longer than {longest:g} s"
         return safety.fault.reason if safety.fault else why
 
     def lift_weight(self, share: float) -> str:

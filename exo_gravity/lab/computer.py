@@ -30,7 +30,7 @@ from exo_gravity.core.motors.joint_motor import REPLY_SHARE, SIMULATED_BUSES, Tr
 from exo_gravity.core.safety.limits import CAN_BRIDGE, limits_of
 from exo_gravity.hardware.bus_lock import borrowed
 from exo_gravity.hardware.can_port import ArmOnBus, serials_of
-from exo_gravity.hardware.clock import raise_priority, request_real_time
+from exo_gravity.hardware.clock import raise_priority, set_realtime_priority
 from exo_gravity.hardware.network import MIDDLEWARE, check_environment, open_to_others, restrict_to_localhost
 from exo_gravity.lab.inputs.arms import node_values
 from exo_gravity.lab.inputs.node_checks import check_nodes
@@ -131,7 +131,7 @@ def measure(period: float, seconds: float, priority: int) -> Wakeups:
 
     thread = threading.Thread(target=run)
     thread.start()
-    request_real_time(priority, refused.append)
+    set_realtime_priority(priority, refused.append)
     thread.join()
     return Wakeups(lateness, os.getpriority(os.PRIO_PROCESS, 0), tuple(refused))
 

@@ -21,7 +21,7 @@ from exo_gravity.core.arm.tilt import AXES, Tilt
 from exo_gravity.core.compensation.compensator import CLIENT_EFFORT, Compensator
 from exo_gravity.core.compensation.settings import Settings
 from exo_gravity.core.numbers import COVER, Torque
-from exo_gravity.core.vocabulary import NO_REASON, NONE, Reason
+from exo_gravity.core.vocabulary import NO_REASON, NONE, Status
 from exo_gravity.lab.calibration.tracking import MOTION, Line, Station, Sweep, Tracker, average, followed
 from exo_gravity.lab.vocabulary import WeighingPhase, WeighingRefused, WeighingTrouble
 
@@ -61,21 +61,21 @@ class Weighed(NamedTuple):
     lever: np.ndarray
 
 
-def refusal(s: Settings, terms: Sequence[str], rate: float) -> Reason:
+def refusal(s: Settings, terms: Sequence[str], rate: float) -> Status:
     """Return why nothing can be weighed with these settings, active terms, and joint states at `rate` Hz."""
     if carriers := [name for name in terms if name in CARRIERS]:
-        return Reason(WeighingRefused.TERMS, f"{', '.join(carriers)} would carry a part of the load: switch it off")
+        return Status(WeighingRefused.TERMS, f"{', '.join(carriers)} would carry a part of the load: switch it off")
     if any(s.wearer_mass) and (s.mode != "zero_g" or s.support < 1.0):
-        return Reason(
+        return Status(
             WeighingRefused.SUPPORT,
             "a wearer can relax only while the whole arm is carried: mode zero_g with support 1",
         )
     if rate < WEIGHING.least_rate:
-        return Reason(
+        return Status(
             WeighingRefused.SLOW, f"joint states come at {rate:.0f} Hz, must be {WEIGHING.least_rate:g} or more"
         )
     if not s.robot.has_hand:
-        return Reason(WeighingRefused.NO_HAND, "urdf.hand does not say which link holds a load")
+        return Status(WeighingRefused.NO_HAND, "urdf.hand does not say which link holds a load")
     return NO_REASON
 
 
@@ -178,7 +178,7 @@ class Weighing:
 
     def interrupt(self, why: str) -> None:
         """End it without a result."""
-        self.trouble = Reason(WeighingTrouble.SETTINGS_CHANGED, why)
+        self.trouble = Status(WeighingTrouble.SETTINGS_CHANGED, why)
 
     def _begin(self, theta: Sequence[float], velocity: Sequence[float], tilt: Tilt) -> None:
         """Refuse a pose that shows no load, and an arm that moves; compute what depends on the pose alone.
@@ -192,12 +192,12 @@ class Weighing:
         fastest = max(map(abs, velocity))
         if np.linalg.norm(self._lever) < WEIGHING.least_lever:
             pose = "bend the elbow by 45 degrees"
-            self.trouble = Reason(
+            self.trouble = Status(
                 WeighingTrouble.HANGS_DOWN, f"the hand hangs below the joints, where a load needs no torque: {pose}"
             )
             return
         if fastest > WEIGHING.start_speed:
-            self.trouble = Reason(WeighingTrouble.MOVES, f"the arm moves at {fastest:.2f} rad/s: hold it still")
+            self.trouble = Status(WeighingTrouble.MOVES, f"the arm moves at {fastest:.2f} rad/s: hold it still")
         wearer = s.worn(s.robot.massless(gravity))
         self._worn = np.array(wearer.torque(theta, tilt))  # Nm
         by_tilt = np.array([s.arm.torque(theta, axis) for axis in AXES]).T  # (n, 3) Nm/rad
@@ -236,21 +236,21 @@ class Weighing:
         is_foreign = max(foreign) > WEIGHING.foreign or not -WEIGHING.lifted < mass < MAX_PAYLOAD
         self._foreign = self._foreign + dt if is_foreign else 0.0
         if not dt <= WEIGHING.pause:
-            self.trouble = Reason(WeighingTrouble.NO_JOINT_STATES, f"no joint states for {1000.0 * dt:.0f} ms")
+            self.trouble = Status(WeighingTrouble.NO_JOINT_STATES, f"no joint states for {1000.0 * dt:.0f} ms")
         elif abs(error[worst]) > WEIGHING.largest_error:
             is_thrown = float(error @ self._lever) < 0.0
             why = "was the load dropped?" if is_thrown else "relax gradually, and touch nothing"
-            self.trouble = Reason(
+            self.trouble = Status(
                 WeighingTrouble.MOVED_AWAY, f"{self._names[worst]} moved by {abs(error[worst]):.2f} rad: {why}"
             )
         elif self._foreign > WEIGHING.persistence:
-            self.trouble = Reason(
+            self.trouble = Status(
                 WeighingTrouble.HAND_ON_ARM,
                 f"{self._names[int(np.argmax(foreign))]}: {max(foreign):.1f} Nm of a hand on the arm",
             )
         elif saturated:
             remedy = "the load needs more than max_effort here: hold it nearer to the body"
-            self.trouble = Reason(WeighingTrouble.TOO_HEAVY, f"{', '.join(saturated)}: {remedy}")
+            self.trouble = Status(WeighingTrouble.TOO_HEAVY, f"{', '.join(saturated)}: {remedy}")
         return bool(self.trouble)
 
     def _finish(self, sweeps: Sequence[Sweep], shares: np.ndarray) -> None:
@@ -265,17 +265,17 @@ class Weighing:
         unlike = np.abs(seen.effort - needed) - known - WEIGHING.unlike[0] - WEIGHING.unlike[1] * np.abs(needed)
         restless = math.hypot(*(weight * unrest)) / gravity
         if restless > WEIGHING.unrest[0] + WEIGHING.unrest[1] * abs(mass):
-            self.trouble = Reason(
+            self.trouble = Status(
                 WeighingTrouble.RESTLESS, f"{restless:.2f} kg between two turns: relax, and touch nothing"
             )
         for name, share, off in zip(self._names, shares, unlike, strict=True):
             if share < MOTION.followed:
-                self.trouble = Reason(
+                self.trouble = Status(
                     WeighingTrouble.NOT_FOLLOWED, f"{name} does not follow: is the arm carried, is a hand on it?"
                 )
             elif off > 0.0:
                 torque = f"{off + WEIGHING.unlike[0]:.1f} Nm"
-                self.trouble = Reason(
+                self.trouble = Status(
                     WeighingTrouble.NO_LOAD,
                     f"{name}: no load in the hand explains {torque}: someone may be touching the arm",
                 )
@@ -296,7 +296,7 @@ class Weigher:
         self._control, self._names = control, names
         self._count, self._refusal = 0, NO_REASON
 
-    def begin(self, rate: float) -> Reason:
+    def begin(self, rate: float) -> Status:
         """Begin a weighing with joint states at `rate` Hz; return why it does not begin, false if it does."""
         control, last = self._control, self.weighing
         self._refusal = refusal(control.settings, control.terms.active, rate)
@@ -305,9 +305,9 @@ class Weigher:
         if self._refusal:
             return self._refusal
         if last and not last.is_over:
-            self._refusal = Reason(WeighingRefused.UNDER_WAY, "a weighing is under way")
+            self._refusal = Status(WeighingRefused.UNDER_WAY, "a weighing is under way")
         elif not control.lend(weighing):
-            self._refusal = Reason(WeighingRefused.CHANGING_LOAD, "the load is changing: wait for it")
+            self._refusal = Status(WeighingRefused.CHANGING_LOAD, "the load is changing: wait for it")
         else:
             self.weighing, self._count = weighing, self._count + 1
         return self._refusal
@@ -329,8 +329,8 @@ class Weigher:
             "weighing": weighing.phase if weighing else WeighingPhase.NONE,
             "weighing text": weighing.text if weighing else "",
             "weighing number": self._count,
-            "weighing trouble": weighing.trouble.word if weighing else NONE,
-            "weigh refused": self._refusal.word,
+            "weighing trouble": weighing.trouble.code if weighing else NONE,
+            "weigh refused": self._refusal.code,
             "weigh refused text": self._refusal,
             **{key: NONE if one is None else f"{round(one, digits):.12g}" for key, (one, digits) in figures.items()},
         }

@@ -104,7 +104,7 @@ class CalibratorNode(Node):
         now = time.monotonic()
         with self._lock:
             tilt, state = self._tilt.at(now), self._bridge_state
-            problem = self._tilt.problem(now) if self._uses_imu else ""
+            problem = self._tilt.problem(now).text if self._uses_imu else ""
         if problem and self._began:
             self._trouble = self._trouble or problem
         if problem or self._trouble:

@@ -33,7 +33,7 @@ from exo_gravity.core.compensation.support import NAME, TOPIC
 from exo_gravity.core.errors import ParameterError
 from exo_gravity.core.safety.command import State
 from exo_gravity.core.trunk.inputs import FELT, TiltInput
-from exo_gravity.core.vocabulary import NO_REASON, NONE, UNKNOWN, Reason
+from exo_gravity.core.vocabulary import NO_REASON, NONE, UNKNOWN, Status
 from exo_gravity.hardware.urdf_arm import UrdfArm, arm_from, read_urdf
 from exo_gravity.lab.budget import USUAL_TILT, budget, largest_support, motor_torques, overload, workspace
 from exo_gravity.lab.inputs.arms import fitting
@@ -68,7 +68,7 @@ class BudgetWatch:
 
     def __init__(self, node: Node) -> None:
         #: the result for the settings checked last
-        self.result = Reason(Budget.UNKNOWN, "unknown: waiting for can_bridge's parameters")
+        self.result = Status(Budget.UNKNOWN, "unknown: waiting for can_bridge's parameters")
         #: share 0..1 of the wearer's arm within rated torque everywhere, 0 if none is, 'none' without a wearer
         self.largest_support = UNKNOWN
         self._logger = node.get_logger()
@@ -89,13 +89,13 @@ class BudgetWatch:
             bounds = workspace(bridge["position_min"], bridge["position_max"], tilt)
             joints = budget(*arms, springs, support, bounds, *motor_torques(bridge))
         except ParameterError as error:
-            self.result = Reason(Budget.UNKNOWN, f"unknown: can_bridge has {error}")
+            self.result = Status(Budget.UNKNOWN, f"unknown: can_bridge has {error}")
         else:
             overloaded = overload(names, joints)
-            word = Budget.ABOVE_RATED if overloaded else Budget.WITHIN_RATED
-            self.result = Reason(word, overloaded or "within rated torque everywhere")
+            code = Budget.ABOVE_RATED if overloaded else Budget.WITHIN_RATED
+            self.result = Status(code, overloaded or "within rated torque everywhere")
             self.largest_support = NONE if arms[0] == arms[1] else f"{largest_support(joints) or 0.0:g}"
-        if self.result.word != Budget.WITHIN_RATED:
+        if self.result.code != Budget.WITHIN_RATED:
             self._logger.warning(f"{self.result}; efforts stay clamped to max_effort")
 
 
@@ -150,7 +150,7 @@ class WearerNode(Node):
         # Of the compensator: its parameters, what never changes of them, and why they cannot be used.
         self._settings: Settings | None = None
         self._fixed: tuple[object, ...] = ()
-        self._refusal = Reason(NoEstimate.NO_PARAMETERS, f"waiting for the parameters of {self._status_name}")
+        self._refusal = Status(NoEstimate.NO_PARAMETERS, f"waiting for the parameters of {self._status_name}")
         # Of an arm from a URDF: its text where it comes from a topic, and the arm, None for the paper's.
         self._description = ""
         self._descriptions: Any = None  # the topic's subscription
@@ -203,10 +203,10 @@ class WearerNode(Node):
         except (ParameterError, KeyError) as error:
             # A KeyError: of another version, or another program's node.
             what = f"no parameter {error}" if isinstance(error, KeyError) else error
-            self._refusal = Reason(NoEstimate.REFUSED_PARAMETERS, f"the compensator has {what}")
+            self._refusal = Status(NoEstimate.REFUSED_PARAMETERS, f"the compensator has {what}")
             return
         if settings is None:
-            self._refusal = Reason(NoEstimate.NO_DESCRIPTION, f"waiting for the arm's URDF on {values['urdf.topic']}")
+            self._refusal = Status(NoEstimate.NO_DESCRIPTION, f"waiting for the arm's URDF on {values['urdf.topic']}")
             return
         topic = "joint_states"
         if values.get("command_interface") == "multi_array":
@@ -219,7 +219,7 @@ class WearerNode(Node):
             self._trunk = Trunk(self, settings) if settings.use_imu else None
             self._watch = WearerWatch(self._names, settings)
         if fixed != self._fixed:
-            self._refusal = Reason(
+            self._refusal = Status(
                 NoEstimate.REFUSED_PARAMETERS,
                 "the compensator has another arm or another trunk than before: restart this node",
             )
@@ -284,9 +284,9 @@ class WearerNode(Node):
                 statement.header.stamp = message.header.stamp
                 publisher.publish(statement)
         elif trunk is None:
-            self._problem = Reason(NoEstimate.NO_TILT, "no fresh tilt of the trunk")
+            self._problem = Status(NoEstimate.NO_TILT, "no fresh tilt of the trunk")
         else:
-            self._problem = Reason(
+            self._problem = Status(
                 NoEstimate.INCOMPLETE_JOINT_STATES,
                 "joint_states have no possible positions, velocities and efforts of these joints",
             )
@@ -313,17 +313,17 @@ class WearerNode(Node):
         self._requests.publish(request)
 
     @property
-    def _missing(self) -> Reason:
+    def _missing(self) -> Status:
         """What is missing of the compensator, false if nothing is."""
         if self._statuses.within(COMPENSATOR_SILENCE, self._status_name):
             return self._refusal
-        return Reason(NoEstimate.NO_COMPENSATOR, f"waiting for {self._status_name}")
+        return Status(NoEstimate.NO_COMPENSATOR, f"waiting for {self._status_name}")
 
-    def _why_not(self, now: float) -> tuple[bytes, WearerState, Reason]:
+    def _why_not(self, now: float) -> tuple[bytes, WearerState, Status]:
         """Return level, state, and why nothing is estimated."""
         problem = self._missing
         if not problem and now - self._last > SILENCE:
-            problem = Reason(NoEstimate.NO_JOINT_STATES, "waiting for joint_states")
+            problem = Status(NoEstimate.NO_JOINT_STATES, "waiting for joint_states")
             if math.isfinite(self._last):
                 return STALE, WearerState.STOPPED, problem
         problem = problem or self._problem
@@ -332,14 +332,14 @@ class WearerNode(Node):
     def _report(self) -> None:
         now, budget = time.monotonic(), self._budget
         level, state, why_not = self._why_not(now)
-        values: dict[str, object] = {"state": state, "reason": why_not.word, "budget": budget.result.word}
+        values: dict[str, object] = {"state": state, "reason": why_not.code, "budget": budget.result.code}
         values |= {"budget text": budget.result, "largest support": budget.largest_support}
         if self._watch and not self._missing:
             with self._lock:
                 values |= self._watch.values(now)
         else:
             values |= {**values_of(self._names, None, None), "support adapts": Adapts.OFF, "support asked for": NONE}
-        self._diagnostics.report(level, why_not or "estimating the wearer's torque", values)
+        self._diagnostics.report(level, why_not.text or "estimating the wearer's torque", values)
 
 
 def main() -> None:

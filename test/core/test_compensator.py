@@ -22,6 +22,7 @@ from exo_gravity.core.compensation.terms.terms import TermSettings
 from exo_gravity.core.errors import ParameterError
 from exo_gravity.core.safety.guidance import GUIDANCE
 from exo_gravity.core.trunk.inputs import TILT
+from exo_gravity.core.vocabulary import Withdrawal
 
 from ..support import ROBOT
 from ..support.compensator_run import PERIOD, THETA, CompensatorRun, settings_with
@@ -29,11 +30,11 @@ from ..support.compensator_run import PERIOD, THETA, CompensatorRun, settings_wi
 
 def test_without_a_fresh_tilt_there_is_a_reason_instead_of_a_torque():
     run = CompensatorRun(use_imu=True)
-    assert run.cycle()[:2] == (None, "no trunk tilt yet")
+    assert run.cycle()[:2] == (None, (Withdrawal.NO_TILT, "no trunk tilt yet"))
     run.compensator.tilt.set_tilt(run.now, 0.0, 0.0, age=-TILT.lead)
     assert run.cycle(0.078).held == ""
     assert run.cycle(0.004).held.startswith("trunk tilt older than 80 ms: held on")
-    assert run.cycle(0.02).reason == "trunk tilt older than 80 ms"
+    assert run.cycle(0.02).reason.text == "trunk tilt older than 80 ms"
     run = CompensatorRun(use_imu=True)
     run.compensator.tilt.set_tilt(run.now, 0.0, 0.0)
     with pytest.raises(ParameterError):
@@ -56,7 +57,7 @@ def test_a_late_tilt_is_extrapolated_within_the_bound_that_it_states_and_then_wi
             held += 1
             assert error <= float(answer.held.split()[-2])
     assert held * PERIOD == pytest.approx(TILT.hold - 0.08, abs=2 * PERIOD)
-    assert answer.reason == "trunk tilt older than 80 ms"
+    assert answer.reason.text == "trunk tilt older than 80 ms"
 
 
 @pytest.mark.parametrize(
@@ -68,7 +69,7 @@ def test_impossible_joint_angles_get_no_torque(theta):
     run.cycle(2.0)
     answer = run.cycle(theta=theta)
     assert answer.effort is None
-    assert "not 4 numbers within 26 rad" in answer.reason
+    assert "not 4 numbers within 26 rad" in answer.reason.text
 
 
 def test_after_a_break_nothing_is_left_of_a_change():
@@ -240,7 +241,7 @@ def test_the_specific_force_replaces_gravity_and_the_arm_turns_with_the_trunk(fo
     run.cycle(0.1)
     if changes.get("use_imu"):  # whatever the motion, a tilt is too old
         run.compensator.motion.add(run.now, FORCE, STILL)
-        assert "older than 80 ms" in run.cycle().reason
+        assert "older than 80 ms" in run.cycle().reason.text
 
 
 EFFORT = (2.0, -4.0)
@@ -315,7 +316,7 @@ class Arm(CompensatorRun):
 
     @property
     def report(self) -> str:
-        return self.compensator.support_request.report(self.now)
+        return self.compensator.support_request.report(self.now).text
 
 
 def raised() -> Arm:

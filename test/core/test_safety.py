@@ -21,7 +21,7 @@ from exo_gravity.core.safety.lease import LEASE_TIME, Lease
 from exo_gravity.core.safety.limits import DAMPING, DAMPING_RATE, MAX_EFFORT_RATE
 from exo_gravity.core.safety.shape import STILLNESS
 from exo_gravity.core.safety.start import SWITCH_ON, SignCheck
-from exo_gravity.core.vocabulary import NO_REASON, Reason, Wait
+from exo_gravity.core.vocabulary import NO_REASON, Status, Wait
 
 from ..support.copies import prepared
 from ..support.safety_run import EFFORT, LIMITS, PERIOD, SafetyRun, reading
@@ -294,7 +294,7 @@ ROWS: dict[str, Sequence[Step]] = {
     **{
         f"resume is refused after {code}": [
             *let_down_by(code), has(lambda arm: not arm.machine.resume(arm.now)), see(State.FAULT, code),
-            has(lambda arm, code=code: code in arm.machine.why_not_resumed),
+            has(lambda arm, code=code: code in arm.machine.why_not_resumed.text),
         ]
         for code in FINAL
     },
@@ -302,13 +302,13 @@ ROWS: dict[str, Sequence[Step]] = {
         has(lambda arm: not arm.machine.resume(arm.now)), carried, has(lambda arm: not arm.machine.resume(arm.now)),
         trip(FaultCode.COMMAND_STALE), wait(), has(lambda arm: not arm.machine.resume(arm.now)), until(State.FAULT),
         let(silent={1}), wait(0.5), let(silent=set()), wait(0.1), has(lambda arm: not arm.machine.resume(arm.now)),
-        has(lambda arm: "zeros" in arm.machine.why_not_resumed),
+        has(lambda arm: "zeros" in arm.machine.why_not_resumed.text),
     ],
     **{
         f"a silence of {seconds} s with a turn by {turned} keeps zeros {'trusted' if is_trusted else 'in doubt'}": [
             *let_down_by(FaultCode.COMMAND_STALE), let(silent={1}), wait(seconds), let(silent=set()),
             reads(1, position=turned), wait(0.1),
-            has(lambda arm, is_trusted=is_trusted: (arm.machine.why_not_resumed == "") == is_trusted),
+            has(lambda arm, is_trusted=is_trusted: (not arm.machine.why_not_resumed) == is_trusted),
         ]
         for seconds, turned, is_trusted in (
             (0.08, 0.0, True), (0.08, TURN, False), (0.2, 0.0, True), (0.2, -TURN, False), (0.4, 0.0, False),
@@ -325,7 +325,7 @@ ROWS: dict[str, Sequence[Step]] = {
         until(State.RAMPING_IN), has(lambda arm: not arm.command.is_unproven),
     ],
     "a loop that stood still for long leaves zeros in doubt": [
-        *let_down_by(FaultCode.COMMAND_STALE), stall(0.9), wait(), has(lambda arm: arm.machine.why_not_resumed == ""),
+        *let_down_by(FaultCode.COMMAND_STALE), stall(0.9), wait(), has(lambda arm: not arm.machine.why_not_resumed),
         stall(1.1), wait(), see(words="zeros"),
     ],
     "an arm that is carried on after stale efforts may wait for late ones again": [
@@ -348,7 +348,7 @@ ROWS: dict[str, Sequence[Step]] = {
         }.items()
     },
     "the calm second passes while the watchdog starts": [
-        lambda arm: setattr(arm.machine, "setup_error", Reason(Wait.WATCHDOG, "the watchdog to start")),
+        lambda arm: setattr(arm.machine, "setup_error", Status(Wait.WATCHDOG, "the watchdog to start")),
         enable, wait(2.0), see(State.CHECKING), lambda arm: setattr(arm.machine, "setup_error", NO_REASON),
         until(State.PROVING, 0.1),
     ],
@@ -460,7 +460,7 @@ ROWS: dict[str, Sequence[Step]] = {
         ]
         for name, moved, waited, setup_error in (
             ("the arm moves", 0.1, 0.02, NO_REASON),
-            ("time passes", 0.0, 11.0, Reason(Wait.WATCHDOG, "the watchdog to start")),
+            ("time passes", 0.0, 11.0, Status(Wait.WATCHDOG, "the watchdog to start")),
         )
     },
 }  # fmt: skip

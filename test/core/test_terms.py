@@ -401,7 +401,7 @@ def test_a_lost_message_costs_no_torque_for_long_and_when_they_stop_it_is_zero_1
         loop.run(0.1 + 2 * CYCLE if stops else 1.0)
         assert loop.torques[-1] == (NO_TORQUE if stops else pytest.approx(FOLLOWED))
         assert stops or rate < 40 or loop.torques == [pytest.approx(FOLLOWED)] * len(loop.torques)  # effort is valid
-    assert loop.input.state == "waiting" and loop.input.reason == "assist_efforts stopped"
+    assert loop.input.state == "waiting" and loop.input.reason.text == "assist_efforts stopped"
 
 
 WRONG = {
@@ -428,7 +428,7 @@ def test_wrong_messages_fade_the_torque_at_once_and_sound_ones_bring_it_back(cha
         loop.send(**changes)
         loop.run(0.1)
         assert loop.torques[-1] == NO_TORQUE
-        assert loop.input.state == "refused" and reason in loop.input.reason
+        assert loop.input.state == "refused" and reason in loop.input.reason.text
     loop.run(TUNING.recovery - 0.1)
     assert not np.any(loop.torques[round(0.1 / CYCLE) :])
     assert loop.run(2.0) == pytest.approx(FOLLOWED)
@@ -443,7 +443,7 @@ def test_a_frozen_sender_that_repeats_its_last_stamp_is_refused_and_so_is_a_late
         loop.run(0.004)
     assert loop.run(0.03) == NO_TORQUE
     assert loop.input.state == "refused"
-    assert not is_late or "late by their stamp" in loop.input.reason
+    assert not is_late or "late by their stamp" in loop.input.reason.text
 
 
 @pytest.mark.parametrize("pause", [0.3, 120.0])
@@ -468,7 +468,7 @@ def test_a_lower_bound_holds_for_the_efforts_that_are_followed_already_and_with_
     bound, torque, state
 ):
     loop = OuterLoop()
-    assert AssistInput(NAMES).reason.word == "off"  # before the first message, too
+    assert AssistInput(NAMES).reason.code == "off"  # before the first message, too
     loop.input.assist, loop.efforts = Assist((10.0,) * 4), (5.0, -5.0, 0.0, 0.0)
     loop.run(2.0)
     loop.input.assist, loop.sending = Assist((bound,) * 4), False

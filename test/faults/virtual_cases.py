@@ -199,7 +199,7 @@ def outer_loop_case(name: str, inject: Action, reason: str, **options: Any) -> F
     """A row whose outer loop fails, and gravity compensation goes on without it: for a `reason`, '' if it returns."""
 
     def reports(rig: StruckArm) -> None:
-        found = rig.assist.reason.word if rig.assist.reason else ""
+        found = rig.assist.reason.code if rig.assist.reason else ""
         assert found == reason, f"assist reason: {found}"
 
     given = {"check": only_the_assistance_ends, "afterwards": reports, **options}
@@ -208,7 +208,7 @@ def outer_loop_case(name: str, inject: Action, reason: str, **options: Any) -> F
 
 def expired(rig: StruckArm) -> None:
     """Check that the request to enable the arm has ended by itself."""
-    assert rig.safety.refusal.startswith("not enabled within 2 s"), rig.safety.refusal
+    assert rig.safety.refusal.text.startswith("not enabled within 2 s"), rig.safety.refusal
 
 
 def load_is_withdrawn(rig: StruckArm) -> None:

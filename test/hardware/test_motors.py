@@ -108,7 +108,7 @@ def raised_arm(kind: str) -> JudgedArm:
 def test_an_arm_is_switched_on_and_off_without_a_collision(kind: str) -> None:
     arm = arm_of(kind, bitrate=1_000_000)
     arm.enable()
-    assert arm.run_until(lambda: arm.state is State.PROVING and arm.safety.waiting_for == "", 5.0)
+    assert arm.run_until(lambda: arm.state is State.PROVING and not arm.safety.waiting_for, 5.0)
     arm.run(0.5)
     assert arm.device.powered and arm.let_down(1.0)
     assert arm.wire.arbitration.collisions == arm.wire.arbitration.bus_offs == 0
@@ -211,7 +211,7 @@ def test_a_board_in_query_reply_mode_is_not_started_and_the_reason_is_told() -> 
     arm = arm_of("v3_query")
     arm.enable()
     assert arm.run_until(lambda: arm.state is State.DISABLED, 15.0)
-    assert "query-reply" in arm.safety.refusal or "no reply" in arm.safety.refusal
+    assert "query-reply" in arm.safety.refusal.text
     assert not arm.device.powered
 
 

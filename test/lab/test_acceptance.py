@@ -8,7 +8,7 @@ from unittest.mock import Mock
 
 import pytest
 
-from exo_gravity.core.vocabulary import Source
+from exo_gravity.core.vocabulary import NO_REASON, Source
 from exo_gravity.lab.acceptance import STEPS, Bench, BenchStep, Lift, Weight, accept, record
 from exo_gravity.lab.calibration.tours import model_of
 from exo_gravity.lab.inputs.arms import configured_arm, node_values
@@ -117,7 +117,7 @@ def test_what_is_not_as_the_file_says_fails_at_its_step(case):
 def test_a_start_that_takes_too_long_is_none_and_a_person_who_breaks_off_is_told_of_motors_that_stay_on():
     assert "takes longer" in Bench.carry(
         Mock(
-            **{"loop.safety.fault": None, "loop.safety.refusal": "", "loop.safety.waiting_for": ""},
+            **{"loop.safety.fault": None, "loop.safety.refusal": NO_REASON, "loop.safety.waiting_for": NO_REASON},
             **{"until.return_value": False, "motors": ()},
         )
     )

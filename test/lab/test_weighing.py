@@ -52,7 +52,7 @@ def weigh(mass: float, **wearer: Any) -> tuple[Weighing, Rig]:
     arm.act({"move": list(POSE), "over": MOVE}, wearer or {"hold": 20.0})
     arm.run(0.95 * MOVE)
     weigher = Weigher(arm.compensator, PARTS)
-    assert weigher.begin(RATE) == "" and weigher.begin(RATE) == "a weighing is under way"
+    assert not weigher.begin(RATE) and weigher.begin(RATE).text == "a weighing is under way"
     weighing = weigher.weighing
     arm.forget()
     arm.run_until(lambda: weighing.is_over)
@@ -78,11 +78,11 @@ def test_little_pushes_against_a_hand_that_moves_the_arm_and_not_for_long():
     compensator = Compensator(SETTINGS)
     weigher, moved = Weigher(compensator, PARTS), (0.0, 0.5, 0.0, 0.8)
     compensator.step(0.0, POSE, STILL)
-    assert weigher.begin(RATE) == ""
+    assert not weigher.begin(RATE)
     efforts = [
         compensator.step(0.01 * k, pose, STILL).effort[1] for k, pose in enumerate((POSE, *[moved] * 1000), start=1)
     ]
-    assert "shoulder_abduction" in weigher.weighing.trouble and "a hand on the arm" in weigher.weighing.trouble
+    assert re.search("shoulder_abduction.*a hand on the arm", weigher.weighing.trouble.text)
     pushed = np.abs(np.subtract(efforts[100:], SETTINGS.torque(moved, TILT)[0][1]))
     assert 4.0 < pushed.max() < 9.0 and pushed[-1] == pytest.approx(0.0)  # Nm; the motor has 18
 
@@ -113,7 +113,7 @@ def test_an_arm_that_cannot_be_weighed_is_left_alone_with_what_would_be_right(po
     weighing = Weighing(SETTINGS, PARTS, RATE)
     torques = [weighing.torque(0.01, theta, velocity, TILT, STILL) for theta in poses]
     assert torques[-1] == STILL and weighing.result is None
-    assert re.search(said, weighing.trouble) and weighing.text.startswith("not weighed: ")
+    assert re.search(said, weighing.trouble.text) and weighing.text.startswith("not weighed: ")
 
 
 @pytest.mark.parametrize(
@@ -129,7 +129,7 @@ def test_an_arm_that_cannot_be_weighed_is_left_alone_with_what_would_be_right(po
     ],
 )
 def test_what_would_hide_the_load_is_refused_before_anything_moves(changes, terms, rate, said):
-    assert re.search(said, refusal(replace(SETTINGS, **changes), terms, rate))
+    assert re.search(said, refusal(replace(SETTINGS, **changes), terms, rate).text)
     assert Weighing(SETTINGS, PARTS, rate).phase is WeighingPhase.TAKING_OVER  # made before the rate is known
 
 
@@ -151,4 +151,4 @@ def test_with_the_empty_hand_weighed_before_the_error_of_the_model_is_left_out()
     for change, is_known in (({"payload": SETTINGS.payload._replace(mass=0.5)}, True), ({"wearer_mass": STILL}, False)):
         weigher = Weigher(Mock(settings=replace(SETTINGS, **change), **{"terms.active": ()}), PARTS)
         weigher.weighing = first
-        assert weigher.begin(RATE) == "" and (weigher.weighing.empty is first.result) == is_known
+        assert not weigher.begin(RATE) and (weigher.weighing.empty is first.result) == is_known

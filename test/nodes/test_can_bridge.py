@@ -259,7 +259,7 @@ def test_one_request_resumes_or_is_refused_with_the_reason(ask, monkeypatch):
     loop.safety.enable(0.0)
     loop.safety.trip(FaultCode.COMMAND_STALE, "late", 1.0)
     assert ask("resume", loop).startswith("refused: zeros are no longer sure")
-    monkeypatch.setattr(SafetyMachine, "why_not_resumed", "")  # as tested with the machine
+    monkeypatch.setattr(SafetyMachine, "why_not_resumed", NO_REASON)  # as tested with the machine
     assert ask("resume", loop) == ""
     assert (loop.safety.state, loop.safety.fault) == (State.CHECKING, None)
 
@@ -362,7 +362,7 @@ class Exchange:
 
     @property
     def said(self):
-        return self.exchange.refusal.word, self.trips
+        return self.exchange.refusal.code, self.trips
 
 
 @pytest.mark.parametrize("is_one_process", [False, True])
@@ -622,7 +622,7 @@ def test_no_motor_is_switched_on_before_the_watchdog_watches_nor_stays_on_withou
     bridge = make_bridge()
     assert bridge.trigger_configure() is bridge.trigger_activate() is SUCCESS
     safety = bridge.loop.safety
-    wait_until(lambda: safety.waiting_for == "the watchdog to start")
+    wait_until(lambda: safety.waiting_for.text == "the watchdog to start")
     monkeypatch.setattr(NoWatchdog, "alive", False)  # it never started
     spin_until(bridge, lambda: safety.fault)
     assert (safety.state, safety.fault.code) == (State.FAULT, "watchdog_dead")
@@ -667,7 +667,7 @@ def test_a_failed_activation_leaves_nothing_running_and_a_dead_control_thread_is
     bridge = make_bridge()
     assert bridge.trigger_configure() is SUCCESS
     with monkeypatch.context() as patch:
-        patch.setattr(can_bridge, "request_real_time", Mock(side_effect=OSError("no such thread")))
+        patch.setattr(can_bridge, "set_realtime_priority", Mock(side_effect=OSError("no such thread")))
         assert bridge.trigger_activate() is FAILURE
     assert_nothing_runs(bridge, rig)
     assert bridge.trigger_activate() is SUCCESS

@@ -658,8 +658,8 @@ def test_a_joint_that_is_not_listed_is_at_0_for_compensator_wearer_and_tools(alo
     ]
     alone.add(rclpy.create_node("can_bridge", **has))
     watch = BudgetWatch(alone.wearer)
-    alone.wait_until(lambda: watch.update(listed, of_tools.settings) or watch.result.word != Budget.UNKNOWN)
-    assert watch.result.word == Budget.WITHIN_RATED
+    alone.wait_until(lambda: watch.update(listed, of_tools.settings) or watch.result.code != Budget.UNKNOWN)
+    assert watch.result.code == Budget.WITHIN_RATED
     for hand in ("", "hand"):  # of another arm than that which is estimated
         alone.wearer._on_parameters("", {**values, "urdf.hand": hand})
-    assert alone.wearer._refusal.word == "refused_parameters"
+    assert alone.wearer._refusal.code == "refused_parameters"

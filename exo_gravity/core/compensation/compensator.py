@@ -25,7 +25,7 @@ from exo_gravity.core.compensation.terms.terms import Terms, TermsInForce
 from exo_gravity.core.numbers import Torque, clamp, rate_limited
 from exo_gravity.core.params import JOINT_NAMES
 from exo_gravity.core.trunk.inputs import TILT, FeltMotion, TiltInput
-from exo_gravity.core.vocabulary import NO_REASON, Reason, Withdrawal
+from exo_gravity.core.vocabulary import NO_REASON, Status, Withdrawal
 
 FALLBACK_TIME = 0.5  # s for which the chosen law must apply before it replaces the exact law again
 MAX_ANGLE = 26.0  # rad, more than an AK motor can report with any zero
@@ -61,7 +61,7 @@ class Compensation(NamedTuple):
     """What the compensator answers to one reading of the joints."""
 
     effort: Torque | None  #: (n,) Nm; None for the given `reason`
-    reason: Reason  #: why there are no efforts; false if there are
+    reason: Status  #: why there are no efforts; false if there are
     clamped: tuple[int, ...] = ()  #: indices of the joints whose gravity torque exceeds `max_effort`
     fallback: str = ""  #: why the exact law replaced the chosen one
     remainder: Torque = ()  #: (n,) Nm by which a change of load is not done yet; () if none is under way
@@ -137,7 +137,7 @@ class Compensator:
         if len(theta) != len(self._effort) or not all(-MAX_ANGLE <= angle <= MAX_ANGLE for angle in theta):
             expected = f"{len(self._effort)} numbers within {MAX_ANGLE:g} rad"
             impossible = f"joint angles {list(theta)} are not {expected}"
-            return Compensation(None, Reason(Withdrawal.IMPOSSIBLE_ANGLES, impossible))
+            return Compensation(None, Status(Withdrawal.IMPOSSIBLE_ANGLES, impossible))
         late, late_tilt = self.tilt.problem(now) if self.settings.use_imu else NO_REASON, ""
         if late:
             turn = self.tilt.unknown_turn(now)
@@ -153,7 +153,7 @@ class Compensator:
         gravity = self._law(at)
         if not all(map(math.isfinite, gravity)):
             infinite = f"torque {list(gravity)} Nm from the law is not finite"
-            return Compensation(None, Reason(Withdrawal.LAW_NOT_FINITE, infinite))
+            return Compensation(None, Status(Withdrawal.LAW_NOT_FINITE, infinite))
         s, dt = self.settings, now - self._last.time
         torque = gravity
         if velocity:

@@ -10,7 +10,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 from exo_gravity.core.safety.guidance import GUIDANCE
-from exo_gravity.core.vocabulary import NO_REASON, Reason, SupportRequested
+from exo_gravity.core.vocabulary import NO_REASON, Status, SupportRequested
 
 TOPIC, NAME = "support_request", "support"  # of the message, and of its one entry
 
@@ -74,23 +74,23 @@ class SupportRequest:
         self._changed = now
         return wanted
 
-    def report(self, now: float) -> Reason:
+    def report(self, now: float) -> Status:
         """Return what is asked for, or what was wrong with a message of the last seconds, without its value."""
         if now - self._contradicted <= self._tuning.distrust:
-            return Reason(SupportRequested.SECOND_PUBLISHER, f"refused: more than one publisher of {TOPIC}")
+            return Status(SupportRequested.SECOND_PUBLISHER, f"refused: more than one publisher of {TOPIC}")
         if now - self._refused <= self._tuning.expires:
-            return Reason(self._refusal.word, f"refused: {self._refusal}")
+            return Status(self._refusal.code, f"refused: {self._refusal}")
         asked = self.fresh(now)
         if asked is None:
-            return Reason(SupportRequested.NONE, "none")
-        return Reason(SupportRequested.FRESH, f"{100.0 * asked:.0f} %")
+            return Status(SupportRequested.NONE, "none")
+        return Status(SupportRequested.FRESH, f"{100.0 * asked:.0f} %")
 
-    def _problem(self, now: float, names: Sequence[str], values: Sequence[float], stamp: float) -> Reason:
+    def _problem(self, now: float, names: Sequence[str], values: Sequence[float], stamp: float) -> Status:
         """Return what is wrong with a message, false if nothing is."""
         if list(names) != [NAME] or len(values) != 1:
-            return Reason(SupportRequested.INVALID, f"{TOPIC} must have the one name {NAME} with one position")
+            return Status(SupportRequested.INVALID, f"{TOPIC} must have the one name {NAME} with one position")
         if not 0.0 <= values[0] <= 1.0:
-            return Reason(SupportRequested.INVALID, f"{TOPIC} must be a number from 0 to 1")
+            return Status(SupportRequested.INVALID, f"{TOPIC} must be a number from 0 to 1")
         if not now - self._tuning.max_age <= stamp <= now + self._tuning.max_lead:
-            return Reason(SupportRequested.LATE, f"{TOPIC} is late by its stamp, or its clock differs")
+            return Status(SupportRequested.LATE, f"{TOPIC} is late by its stamp, or its clock differs")
         return NO_REASON

@@ -57,7 +57,7 @@ from exo_gravity.core.safety.start import (
     torque_while_hanging,
 )
 from exo_gravity.core.safety.watch import POWER, ArmWatch, Power, PowerChange
-from exo_gravity.core.vocabulary import NO_REASON, Motors, Reason, Resume, Wait
+from exo_gravity.core.vocabulary import NO_REASON, Motors, Resume, Status, Wait
 
 CARRIED = (State.RAMPING_IN, State.ACTIVE)
 
@@ -127,7 +127,7 @@ class SafetyMachine:
         """Start the checks, after which torque ramps in. Return False, and do nothing, unless DISABLED."""
         if self.state is not State.DISABLED:
             return False
-        self.waiting_for, self.refusal = Reason(Wait.REPLIES, "the first replies of the motors"), NO_REASON
+        self.waiting_for, self.refusal = Status(Wait.REPLIES, "the first replies of the motors"), NO_REASON
         self._on(StateEvent.ENABLE, now)
         return True
 
@@ -146,16 +146,16 @@ class SafetyMachine:
         return True
 
     @property
-    def why_not_resumed(self) -> Reason:
+    def why_not_resumed(self) -> Status:
         """Why `resume` would be refused; false if it would not."""
         if self.state is not State.FAULT or self.fault is None:
-            return Reason(Resume.NO_FAULT, f"the arm is {self.state.value}, must be in fault")
+            return Status(Resume.NO_FAULT, f"the arm is {self.state.value}, must be in fault")
         if not self.fault.code.is_resumable:
-            return Reason(
+            return Status(
                 Resume.HAS_CAUSE, f"{self.fault.code} has a cause: look for it, clear the fault, enable the arm"
             )
         unsure = "zeros are no longer sure: let the arm hang, clear the fault, enable the arm"
-        return Reason(Resume.POSSIBLE, "") if self.watch.trusted else Reason(Resume.ZEROS_UNSURE, unsure)
+        return Status(Resume.POSSIBLE, "") if self.watch.trusted else Status(Resume.ZEROS_UNSURE, unsure)
 
     def confirm_pose(self, now: float) -> str:
         """Take the operator's word that the arm hangs as it is drawn; return '' or why that is not asked."""
@@ -281,24 +281,24 @@ class SafetyMachine:
             self.limits, self.motion.trunk_tilt
         )
         if not missing and not self._all_off:
-            missing = Reason(Wait.MOTORS_OFF, "the motors to confirm that they are off")
+            missing = Status(Wait.MOTORS_OFF, "the motors to confirm that they are off")
         if missing or are_late or self._calm_since > self._now:
             self._calm_since = self._now
         if not missing and (efforts.effort is None or are_late):
-            missing = Reason(Wait.EFFORTS, "effort commands")
+            missing = Status(Wait.EFFORTS, "effort commands")
             # While an IMU settles, the compensator answers in time without efforts.
             self._calm_since = max(self._calm_since, self._now + START_GATE.efforts - START_GATE.calm)
         if self.state is State.CHECKING:
             self._check(missing, efforts.effort)
 
-    def _check(self, missing: Fault | Reason, effort: Sequence[float] | None) -> None:
+    def _check(self, missing: Fault | Status, effort: Sequence[float] | None) -> None:
         """Continue to PROVING once all has been well for a while, or trip on a fault that refuses the start."""
         watch, limits = self.watch, self.limits
         if isinstance(missing, Fault):
             if not any(motor.is_clearing for motor in watch.joints):
                 self._latch(missing, self._now)
                 return
-            missing = Reason(missing.code, missing.reason)
+            missing = Status(missing.code, missing.reason)
         asks = not watch.trusted and limits.start_pose == CONFIRM
         patience = limits.enable_timeout + (HANGING_ARM.patience if asks else 0.0)
         if watch.fault:
@@ -306,7 +306,7 @@ class SafetyMachine:
         if asks:
             missing = self.pose.missing(self._now, watch.samples, missing)
         # It passes, too, while the bridge cannot switch motors on, and while the operator looks at the arm.
-        self.waiting_for = self.setup_error or missing or Reason(Wait.CALM, f"{START_GATE.calm:g} s without a fault")
+        self.waiting_for = self.setup_error or missing or Status(Wait.CALM, f"{START_GATE.calm:g} s without a fault")
         is_calm = not (self.setup_error or missing) and self._now - self._calm_since >= START_GATE.calm
         if is_calm and effort is not None and not self.stale.are_used:
             fault = None if watch.trusted else torque_while_hanging(limits, effort)
@@ -322,7 +322,7 @@ class SafetyMachine:
             self._on(StateEvent.PASSED)
         elif self._now - self._since >= patience:
             waited = f"not enabled within {patience:g} s: waited for {self.waiting_for}"
-            self.refusal = Reason(self.waiting_for.word, waited)
+            self.refusal = Status(self.waiting_for.code, waited)
             self._on(StateEvent.REFUSED)
 
     def _prove(self, asked: Sequence[float]) -> None:
@@ -411,7 +411,7 @@ class SafetyMachine:
         self._switch_quiet_off()
         if any(motor.power is Power.ON for motor in self.watch.joints):
             if self.state is State.CHECKING:
-                self.refusal = Reason(Wait.MOTOR_ON, "a motor was still on: it is let down")
+                self.refusal = Status(Wait.MOTOR_ON, "a motor was still on: it is let down")
             self._on(StateEvent.FOUND_ON)
             return self._descend()
         if any(motor.power is Power.ENTERING for motor in self.watch.joints):  # the proof has ended

@@ -14,7 +14,7 @@ from exo_gravity.core.motors.joint_motor import JointSample
 from exo_gravity.core.numbers import rate_limited
 from exo_gravity.core.safety.command import Fault, FaultCode, Send
 from exo_gravity.core.safety.limits import EQUIPMENT, MAX_EFFORT_RATE, Limits
-from exo_gravity.core.vocabulary import NO_REASON, Reason, Wait
+from exo_gravity.core.vocabulary import NO_REASON, Status, Wait
 
 # The gate waits for these to pass; other faults refuse the start.
 TRANSIENT_FAULTS = frozenset(
@@ -90,7 +90,7 @@ def turns_back(limits: Limits, joints: Sequence[JointSample]) -> dict[int, float
 
 def missing_for_a_start(
     limits: Limits, joints: Sequence[JointSample], fault: Fault | None, zeros_are_trusted: bool
-) -> Fault | Reason:
+) -> Fault | Status:
     """Return the fault that refuses a start, or what the motors' readings `joints` lack for it.
 
     fault: what the readings show.
@@ -98,14 +98,14 @@ def missing_for_a_start(
     if fault and fault.code not in TRANSIENT_FAULTS:
         return fault
     if fault and fault.code is not FaultCode.OUTSIDE_LIMITS:
-        return Reason(fault.code, fault.reason)
+        return Status(fault.code, fault.reason)
     for n, turn in turns_back(limits, joints).items():
         low, high = math.degrees(limits.position_min[n]), math.degrees(limits.position_max[n])
         back = f"to be moved by {at_least(turn)} degrees, within its limits {low:.0f} to {high:.0f}"
-        return Reason(Wait.JOINT_LIMITS, f"{limits.joint_names[n]} {back}")
+        return Status(Wait.JOINT_LIMITS, f"{limits.joint_names[n]} {back}")
     # An arm that swings is not where it will hang.
     if any(abs(joint.velocity) > START_GATE.at_rest for joint in joints):
-        return Reason(Wait.REST, "the arm to be at rest")
+        return Status(Wait.REST, "the arm to be at rest")
     if not zeros_are_trusted:
         zeros = zip(limits.joint_names, joints, limits.home, limits.home_tolerance, strict=True)
         for name, joint, home, tolerance in zeros:
@@ -119,7 +119,7 @@ def missing_for_a_start(
     return NO_REASON
 
 
-def missing_of_trunk(limits: Limits, tilt: float) -> Reason:
+def missing_of_trunk(limits: Limits, tilt: float) -> Status:
     """Return what a trunk that is tilted by `tilt` rad from upright lacks for a start.
 
     While the arm hangs, gravity's torque is 0 on a trunk that is upside down too: nothing else shows it.
@@ -128,7 +128,7 @@ def missing_of_trunk(limits: Limits, tilt: float) -> Reason:
         return NO_REASON
     tilted = f"it is tilted by {math.degrees(tilt):.0f} degrees, at most {math.degrees(limits.start_tilt):.0f}"
     causes = "correct rotation_trunk_from_imu or the IMU's driver, or set start_tilt for a wearer who lies"
-    return Reason(Wait.TRUNK, f"a trunk near upright: {tilted}: {causes}")
+    return Status(Wait.TRUNK, f"a trunk near upright: {tilted}: {causes}")
 
 
 def torque_while_hanging(limits: Limits, effort: Sequence[float]) -> Fault | None:
@@ -181,7 +181,7 @@ class PoseQuestion:
         self._confirmed, self._until, self.asked = self.asked, now + HANGING_ARM.valid, ()
         return True
 
-    def missing(self, now: float, joints: Sequence[JointSample], others: Reason) -> Reason:
+    def missing(self, now: float, joints: Sequence[JointSample], others: Status) -> Status:
         """Return what the start lacks at `now` s; others: what it lacks apart from the answer."""
         pose = tuple(joint.position for joint in joints)
         pairs = zip(pose, self._confirmed, strict=True) if self._confirmed else ()
@@ -189,7 +189,7 @@ class PoseQuestion:
             self._confirmed = ()
         is_due = not (others or self._confirmed)
         self.asked = pose if is_due else ()
-        return Reason(Wait.POSE, f"the operator to confirm the pose (degrees): {self.text}") if is_due else others
+        return Status(Wait.POSE, f"the operator to confirm the pose (degrees): {self.text}") if is_due else others
 
 
 def at_least(angle: float) -> str:
@@ -377,7 +377,7 @@ class SignCheck:
         for _ in range(SIGN_PUSH.disturbed + 1):
             if (yield from self._push(i, sign, most)):
                 break
-            self.hint = Reason(Wait.HOLD_STILL, f"{self._names[i]} moves without being pushed: hold still")
+            self.hint = Status(Wait.HOLD_STILL, f"{self._names[i]} moves without being pushed: hold still")
         else:
             yield self._fault(i, "it moves without being pushed: hold still and let it hang")
         self.hint = NO_REASON

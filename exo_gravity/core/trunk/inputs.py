@@ -24,7 +24,7 @@ from exo_gravity.core.arm.rotation import ZERO, Floats3, acceleration_of, plus, 
 from exo_gravity.core.arm.tilt import Tilt, angle_between, gravity_in_trunk
 from exo_gravity.core.errors import ParameterError
 from exo_gravity.core.numbers import Vector
-from exo_gravity.core.vocabulary import NO_REASON, Reason, Withdrawal
+from exo_gravity.core.vocabulary import NO_REASON, Status, Withdrawal
 
 NOT_REPORTED = -1.0  # first entry of the covariance of what an IMU does not measure (REP-145)
 
@@ -138,19 +138,19 @@ class TiltInput:
             return math.inf
         return (TILT.turn_rate if any(self._angular_velocity) else TILT.turn_rate_alone) * (now - self._in_time)
 
-    def problem(self, now: float) -> Reason:
+    def problem(self, now: float) -> Status:
         """Return why there is no fresh tilt at `now`; false if there is one."""
         if now - self._time <= self.timeout:
             return NO_REASON
-        word, text = Withdrawal.LATE_TILT, f"trunk tilt older than {self.timeout * 1000:.0f} ms"
+        code, text = Withdrawal.LATE_TILT, f"trunk tilt older than {self.timeout * 1000:.0f} ms"
         if self._time == -math.inf:
-            word, text = Withdrawal.NO_TILT, "no trunk tilt yet"
+            code, text = Withdrawal.NO_TILT, "no trunk tilt yet"
         elif now - self._arrival <= self.timeout:
             lags = "by its stamp: the IMU driver lags, or its clock differs"
-            word, text = Withdrawal.LATE_TILT_STAMP, f"{text} {lags}"
+            code, text = Withdrawal.LATE_TILT_STAMP, f"{text} {lags}"
         if self._refusal:
-            return Reason(Withdrawal.REFUSED_TILT, f"{text} (the newest was refused: {self._refusal})")
-        return Reason(word, text)
+            return Status(Withdrawal.REFUSED_TILT, f"{text} (the newest was refused: {self._refusal})")
+        return Status(code, text)
 
     def _set(self, now: float, gravity: Callable[[], Vector], angular_velocity: Sequence[float], age: float) -> None:
         """Take a direction of gravity, or note why it is refused and raise ParameterError."""

@@ -139,7 +139,7 @@ class OfflineTrial:
             for values in ((min(times),), position, velocity, measured, effort or self._no_effort):
                 self._rows.extend(values)
         self._controller.take(now, samples)
-        reason = self._controller.answer.reason
+        reason = self._controller.answer.reason.text
         if reason and reason != self._reason:
             self._note(now, "compensator", f"withdrawn: {reason}", None)
         self._reason = reason

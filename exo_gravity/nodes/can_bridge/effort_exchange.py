@@ -22,7 +22,7 @@ from exo_gravity.core.errors import ParameterError
 from exo_gravity.core.motors.joint_motor import JointSample
 from exo_gravity.core.safety.command import CARRYING, NO_EFFORTS, Efforts, FaultCode
 from exo_gravity.core.safety.limits import Limits
-from exo_gravity.core.vocabulary import NO_REASON, Reason, RefusedEfforts
+from exo_gravity.core.vocabulary import NO_REASON, RefusedEfforts, Status
 from exo_gravity.hardware.control_loop import ControlLoop
 from exo_gravity.nodes.ros.messages import LATE_TILT, by_name, to_nanoseconds
 from exo_gravity.nodes.ros.subscriptions import SHORT_QUEUE, PolledSubscription, Publishers
@@ -94,7 +94,7 @@ class EffortExchange:
         if loop is None:
             return
         if self._commander.note(info):
-            self.refusal = Reason(RefusedEfforts.SECOND_PUBLISHER, "a second publisher of effort_commands")
+            self.refusal = Status(RefusedEfforts.SECOND_PUBLISHER, "a second publisher of effort_commands")
             self.newest = Efforts(None, time.monotonic(), False, False)  # fails the start gate
             if loop.safety.state in CARRYING:
                 loop.trip(FaultCode.SECOND_COMMANDER, "more than one publisher of effort_commands")
@@ -105,14 +105,14 @@ class EffortExchange:
         answered = self._published.get(to_nanoseconds(message.header.stamp))
         if answered is None:
             unknown = f"stamp {to_nanoseconds(message.header.stamp)} ns answers no joint state of this bridge"
-            self.refusal = Reason(RefusedEfforts.UNKNOWN_STAMP, unknown)
+            self.refusal = Status(RefusedEfforts.UNKNOWN_STAMP, unknown)
         else:
             try:
                 effort = by_name(message, "effort", self._limits.joint_names) if message.effort else None
                 if any(message.velocity):
                     raise ParameterError("velocity", list(message.velocity), "empty, or zeros to ask for damping")
             except ParameterError as error:
-                effort, self.refusal = None, Reason(RefusedEfforts.INVALID, str(error))
+                effort, self.refusal = None, Status(RefusedEfforts.INVALID, str(error))
                 loop.trip(FaultCode.COMMAND_IMPOSSIBLE, f"effort_commands: {error.name} must be {error.expected}")
             is_late = message.header.frame_id == LATE_TILT
             self.newest = Efforts(effort, answered, bool(message.velocity), is_late)

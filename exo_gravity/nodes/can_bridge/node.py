@@ -30,9 +30,9 @@ from exo_gravity.core.motors.joint_motor import OPTIONS, motors_of, traffic_of
 from exo_gravity.core.safety.command import NO_EFFORTS, FaultCode, State
 from exo_gravity.core.safety.limits import CAN_BRIDGE, check_bridge, limits_of
 from exo_gravity.core.trunk.inputs import TiltInput
-from exo_gravity.core.vocabulary import NO_REASON, Reason, Wait
+from exo_gravity.core.vocabulary import NO_REASON, Status, Wait
 from exo_gravity.hardware.can_port import ArmOnBus, serials_of
-from exo_gravity.hardware.clock import request_real_time
+from exo_gravity.hardware.clock import set_realtime_priority
 from exo_gravity.hardware.control_loop import ControlLoop
 from exo_gravity.hardware.motor_bus import MotorBus
 from exo_gravity.hardware.network import restrict_to_localhost
@@ -156,7 +156,7 @@ class CanBridge(LifecycleNode):
         loop = ControlLoop(bus, self._arm.limits, self._arm.period, self._exchange, self._owned.watchdog.hand_over)
         loop.start()
         try:
-            request_real_time(self._thread_priority, self.get_logger().warning)
+            set_realtime_priority(self._thread_priority, self.get_logger().warning)
         except BaseException:
             loop.stop()
             raise
@@ -234,7 +234,7 @@ class CanBridge(LifecycleNode):
     def _check_watchdog(self, watchdog: Watchdog, loop: ControlLoop) -> None:
         """Let no motor be switched on before the watchdog watches, and none stay on without it or this node."""
         loop.attended = time.monotonic()
-        loop.setup_error = Reason(Wait.WATCHDOG, "the watchdog to start") if watchdog.is_starting else NO_REASON
+        loop.setup_error = Status(Wait.WATCHDOG, "the watchdog to start") if watchdog.is_starting else NO_REASON
         if not watchdog.alive and loop.safety.state is not State.LETTING_DOWN:
             loop.trip(FaultCode.WATCHDOG_DEAD, "the watchdog process has died, is frozen, or did not start")
 

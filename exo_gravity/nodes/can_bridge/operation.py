@@ -35,7 +35,7 @@ from exo_gravity.core.safety.command import Efforts, FaultCode, State
 from exo_gravity.core.safety.lease import Lease
 from exo_gravity.core.safety.machine import SafetyMachine
 from exo_gravity.core.safety.start import at_least, turns_back
-from exo_gravity.core.vocabulary import INACTIVE, NO_REASON, NONE, UNKNOWN, Answer, BridgeWarning, Reason, words
+from exo_gravity.core.vocabulary import INACTIVE, NO_REASON, NONE, UNKNOWN, Answer, BridgeWarning, Status, words
 from exo_gravity.hardware.can_port import ArmOnBus, serial_of
 from exo_gravity.hardware.clock import COMPUTER_CLOCK, Clock
 from exo_gravity.hardware.control_loop import ControlLoop
@@ -152,10 +152,10 @@ class BridgeServices:
         """Run `function` on the control thread, and fill the response."""
         loop, lets_down = self._get_loop(), function == self.enable and not request.data
         if loop is None:
-            why_not = Reason(Answer.INACTIVE, "the node is not active")
+            why_not = Status(Answer.INACTIVE, "the node is not active")
         else:
             why_not = await self._carry_out(loop, function, request, lets_down)
-        self.last = "let_down" if lets_down else function.__name__, why_not.word
+        self.last = "let_down" if lets_down else function.__name__, why_not.code
         response.success, response.message = not why_not, str(why_not)
         if loop is not None and response.success:
             response.message = FOLLOWS.get(loop.safety.state, "")
@@ -165,7 +165,7 @@ class BridgeServices:
 
     async def _carry_out(
         self, loop: ControlLoop, function: Callable[[ControlLoop, Any], str], request: Any, lets_down: bool
-    ) -> Reason:
+    ) -> Status:
         """Run `function` on the control thread; return why it was not carried out, false if it was.
 
         A call that has timed out never runs later: an arm must not be enabled after its operator was refused.
@@ -174,9 +174,9 @@ class BridgeServices:
             for waiting in tuple(self._arming):
                 waiting.cancel()
         elif too_old := why_too_old(self._node):
-            return Reason(Answer.TOO_OLD, too_old)
+            return Status(Answer.TOO_OLD, too_old)
         elif refusal := self._refusal():
-            return Reason(Answer.LEAVING, refusal)
+            return Status(Answer.LEAVING, refusal)
         future = loop.call(lambda: function(loop, request))
         if not lets_down:
             self._arming.add(future)
@@ -186,13 +186,13 @@ class BridgeServices:
         try:
             refusal = future.result(0.0)
         except BusError as error:
-            return Reason(Answer.BUS_ERROR, str(error))
+            return Status(Answer.BUS_ERROR, str(error))
         except futures.CancelledError:
-            return Reason(Answer.OVERTAKEN, "refused: the arm was asked to be let down")
+            return Status(Answer.OVERTAKEN, "refused: the arm was asked to be let down")
         except futures.TimeoutError:  # before Python 3.11 not the built-in one
             future.cancel()
-            return Reason(Answer.NO_RESPONSE, "the control thread did not respond")
-        return Reason(Answer.REFUSED if refusal else Answer.DONE, refusal)
+            return Status(Answer.NO_RESPONSE, "the control thread did not respond")
+        return Status(Answer.REFUSED if refusal else Answer.DONE, refusal)
 
 
 class Operator:
@@ -293,7 +293,7 @@ class BridgeReport:
         names = zip(self._names, arm.motors, strict=True)
         self._without_timeout = words(*[name for name, motor in names if not motor.timeout])
 
-    def send(self, loop: ControlLoop | None, newest: Efforts, refusal: Reason, error: str) -> None:
+    def send(self, loop: ControlLoop | None, newest: Efforts, refusal: Status, error: str) -> None:
         """Report on `loop`, None while the node is inactive.
 
         refusal: why the last message was refused. error: why the last transition failed, ''.
@@ -335,7 +335,7 @@ class BridgeReport:
             "fault joint": (fault and fault.joint) or NONE,
             "fault text": fault.reason if fault else "",
             **self._start(safety, samples),
-            "resume": resume.word,
+            "resume": resume.code,
             "resume text": resume,
             **operator,
             "warnings": words(*warnings),
@@ -354,7 +354,7 @@ class BridgeReport:
             "motors without time-out": self._without_timeout,
             "publishing errors": loop.cycle_errors,
             "publishing error text": loop.cycle_error if loop.cycle_errors else "",
-            "refused message": refusal.word,
+            "refused message": refusal.code,
             "refused message text": refusal,
         }
         for name, joint, warmed, (power, rms, share) in zip(self._names, samples, self._warmed, loads, strict=True):
@@ -377,10 +377,10 @@ class BridgeReport:
         turns = {n: turn for n, turn in turns_back(self._limits, samples).items() if math.isfinite(turn)}
         pose = [math.degrees(angle) for angle in safety.pose.asked]
         return {
-            "waiting for": waiting.word,
+            "waiting for": waiting.code,
             "waiting text": waiting,
             "signs proven (%)": row([100.0 * safety.signs.progress], 0),
-            "refusal": safety.refusal.word,
+            "refusal": safety.refusal.code,
             "refusal text": safety.refusal,
             "joints outside limits": words(*[self._names[n] for n in turns]),
             "turn back (deg)": words(*map(at_least, turns.values())),

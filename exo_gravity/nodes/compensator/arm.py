@@ -88,7 +88,7 @@ def report(control: Compensator, answer: Compensation, names: Sequence[str]) -> 
         "mode": s.mode,
         "support": s.support,
         "support in use": row([s.support_now]),
-        "support request": control.support_request.report(now).word,
+        "support request": control.support_request.report(now).code,
         "support requested": NONE if asked is None else row([asked]),
         **facts,
         "wearer mass (kg)": row(s.wearer_mass),
@@ -98,7 +98,7 @@ def report(control: Compensator, answer: Compensation, names: Sequence[str]) -> 
         "payload mass (kg)": f"{s.payload.mass:.3f}",
         "terms": words(*terms.active),
         "assist": terms.assist.state,
-        "assist reason": why_not.word,
+        "assist reason": why_not.code,
         "assist text": why_not,
         "inertia tank (J)": f"{terms.tank.level:.2f}",
     }
@@ -231,7 +231,7 @@ class MultiArrayInterface(PeriodicThread):
             if self._is_late:
                 return  # one late message is not yet a reason to let the arm down
             if answer.effort is None:
-                self._fade.withdraw(now, answer.reason)
+                self._fade.withdraw(now, answer.reason.text)
             elif effort := self._fade.take(now, answer.effort, self._applied, self._velocity):
                 self._publish(effort)
 

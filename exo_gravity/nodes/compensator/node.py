@@ -27,8 +27,8 @@ from exo_gravity.core.compensation.terms.terms import Terms
 from exo_gravity.core.errors import ParameterError
 from exo_gravity.core.numbers import Rate
 from exo_gravity.core.params import installed, loaded
-from exo_gravity.core.vocabulary import NO_REASON, NONE, CompensatorState, Reason, Withdrawal, words
-from exo_gravity.hardware.clock import request_real_time
+from exo_gravity.core.vocabulary import NO_REASON, NONE, CompensatorState, Status, Withdrawal, words
+from exo_gravity.hardware.clock import set_realtime_priority
 from exo_gravity.nodes.compensator.arm import (
     JointStateInterface,
     MultiArrayInterface,
@@ -107,7 +107,7 @@ class CompensatorNode(Node):
         for thread in self._threads:
             if not is_called or thread is not self._joint_states:
                 thread.start()
-        request_real_time(values["thread_priority"], self.get_logger().warning)
+        set_realtime_priority(values["thread_priority"], self.get_logger().warning)
 
     def _serve_wearer(self, terms: Terms) -> None:
         """Add assistance, support on request, and the services of clients, such as `weigh`."""
@@ -169,16 +169,16 @@ class CompensatorNode(Node):
             if self._urdf:
                 self._urdf.follow(message.name, message.position)
             if self._interface.problem:  # no step: there is no torque to change
-                answer = Compensation(None, Reason(Withdrawal.OUTPUT_FAULT, self._interface.problem))
+                answer = Compensation(None, Status(Withdrawal.OUTPUT_FAULT, self._interface.problem))
             else:
                 with self._lock:
                     self._control.applied = message.effort if message.name == self._names else None
                     answer = self._control.step(now, theta, velocity)
         except ParameterError as error:
             refused = self._refused(self._interface.topic, error)
-            answer = Compensation(None, Reason(Withdrawal.INVALID_JOINT_STATES, refused))
+            answer = Compensation(None, Status(Withdrawal.INVALID_JOINT_STATES, refused))
         if problem := second_publisher(self._sources):
-            answer = Compensation(None, Reason(Withdrawal.SECOND_PUBLISHER, problem))
+            answer = Compensation(None, Status(Withdrawal.SECOND_PUBLISHER, problem))
         efforts = self._interface.send(now, message, answer)
         self._answers += answer.effort is not None
         self._rides += bool(answer.held and not self._answer.held)
@@ -230,7 +230,7 @@ class CompensatorNode(Node):
 
     def _values(self, now: float, answer: Compensation) -> dict[str, object]:
         return {
-            "reason": answer.reason.word,
+            "reason": answer.reason.code,
             "reason text": answer.reason,
             "warnings": words(*warnings_of(self._control, answer, self._names)),
             **self._interface.values,

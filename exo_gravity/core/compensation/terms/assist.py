@@ -18,7 +18,7 @@ from exo_gravity.core.compensation.terms.catalogue import TermParameters
 from exo_gravity.core.numbers import JOINT_COUNT, Torque, clamp
 from exo_gravity.core.params import owned
 from exo_gravity.core.safety.limits import MAX_COMMAND
-from exo_gravity.core.vocabulary import NO_REASON, AssistProblem, Reason
+from exo_gravity.core.vocabulary import NO_REASON, AssistProblem, Status
 
 
 @dataclass(frozen=True)
@@ -35,7 +35,7 @@ class AssistTuning:
 
 
 ASSIST = AssistTuning()
-NOTHING_YET = Reason(AssistProblem.NO_MESSAGES, "no assist_efforts yet")
+NOTHING_YET = Status(AssistProblem.NO_MESSAGES, "no assist_efforts yet")
 
 
 @dataclass(frozen=True)
@@ -71,9 +71,9 @@ class AssistInput:
         return "refused" if self._last - self._refused < ASSIST.recovery else "waiting"
 
     @property
-    def reason(self) -> Reason:
+    def reason(self) -> Status:
         """Why there is no full assistance."""
-        return self._why if self.assist.on else Reason(AssistProblem.OFF, "assist.max_effort is 0")
+        return self._why if self.assist.on else Status(AssistProblem.OFF, "assist.max_effort is 0")
 
     @property
     def valid(self) -> float:
@@ -102,17 +102,17 @@ class AssistInput:
 
     def _problem(
         self, now: float, names: Sequence[str], efforts: Sequence[float], stamp: float, second: bool
-    ) -> Reason:
+    ) -> Status:
         """Return what is wrong with a message, without a measured value; false if nothing is."""
         if sorted(names) != sorted(self._names) or len(efforts) != len(names):
             unnamed = f"assist_efforts must name {', '.join(self._names)}, each once, with one effort each"
-            return Reason(AssistProblem.INVALID, unnamed)
+            return Status(AssistProblem.INVALID, unnamed)
         if not all(-MAX_COMMAND <= tau <= MAX_COMMAND for tau in efforts):
-            return Reason(AssistProblem.INVALID, f"assist_efforts must be numbers within {MAX_COMMAND:g} Nm")
+            return Status(AssistProblem.INVALID, f"assist_efforts must be numbers within {MAX_COMMAND:g} Nm")
         if second:
-            return Reason(AssistProblem.SECOND_PUBLISHER, "more than one publisher of assist_efforts")
+            return Status(AssistProblem.SECOND_PUBLISHER, "more than one publisher of assist_efforts")
         if not now - self.valid <= stamp <= now + ASSIST.max_lead:
-            return Reason(AssistProblem.LATE, "assist_efforts are late by their stamp, or their clock differs")
+            return Status(AssistProblem.LATE, "assist_efforts are late by their stamp, or their clock differs")
         return NO_REASON
 
     def torque(self, now: float) -> Torque:
@@ -130,5 +130,5 @@ class AssistInput:
             self._why = NO_REASON
         else:
             is_new = self._stamp == -math.inf
-            self._why = NOTHING_YET if is_new else Reason(AssistProblem.STOPPED, "assist_efforts stopped")
+            self._why = NOTHING_YET if is_new else Status(AssistProblem.STOPPED, "assist_efforts stopped")
         return not self.reason

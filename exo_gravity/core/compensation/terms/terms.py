@@ -151,7 +151,7 @@ class Terms:
     def problem(self) -> str:
         """Why the sum of the terms or the outer loop's efforts are not used although they are asked for, or ''."""
         assist = self.assist
-        refused = assist.reason if assist.assist.on and assist.state == "refused" else ""
+        refused = assist.reason.text if assist.assist.on and assist.state == "refused" else ""
         return self._refusal or refused
 
     def apply(self, settings: TermSettings, arm: Arm) -> None:
