@@ -79,6 +79,7 @@ def test_a_real_arm_must_have_held_for_half_of_each_hold_of_the_script(found, du
     report, why = analysed(bag_with(found), script, guided, given)
     assert why.startswith(trouble) and bool(why) == bool(trouble)
     assert len(report.arms[0][1].holds) == (0 if "0 of 2" in trouble else found)
+    assert (why in report.notes) == (why != given)  # the page says it too
 
 
 def test_only_holds_of_a_minute_are_judged_by_their_rate_and_a_simulator_makes_a_guide_needless():

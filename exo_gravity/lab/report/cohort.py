@@ -60,7 +60,9 @@ def summary(path: str, criteria: HoldCriteria, min_hold: float, every: int) -> l
     }
     rows: list[Row] = []
     for recording, analysis in report.arms:
-        settings = report.settings[recording.name].at(math.inf)
+        # A session may end with other settings than those in which the arm was held.
+        longest = max(analysis.holds, key=lambda hold: hold.duration, default=None)
+        settings = report.settings[recording.name].at(longest.start if longest else math.inf)
         part = report.wearers.get(recording.name)
         of_arm = {
             **shared,

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 from datetime import datetime, timezone
 from functools import cached_property
 from html import escape
-from itertools import compress
+from itertools import chain, compress
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -31,7 +31,7 @@ from exo_gravity.lab.inputs.arms import recorded_of
 from exo_gravity.lab.inputs.parameter_file import node_of
 from exo_gravity.lab.observer import WearerPart, wearer_of, wearer_sentences
 from exo_gravity.lab.report import html, table
-from exo_gravity.lab.trial.analysis import MIN_HOLD, MOVED, HoldCriteria, Recording, TrialAnalysis, failures
+from exo_gravity.lab.trial.analysis import MIN_HOLD, MOVED, HoldCriteria, Recording, TrialAnalysis
 from exo_gravity.lab.trial.analysis import analyse as analyse_arm
 from exo_gravity.lab.vocabulary import STATEMENTS, of_all
 
@@ -40,7 +40,9 @@ if TYPE_CHECKING:
 
 EARLY = 0.2  # s; can_bridge publishes its state every 0.1 s, so a shorter gap to the script's end means nothing
 NEAR = 1.0  # s between a let-down and the fault that caused it
-LOAD = ("mode", "support", "wearer.", "payload.")  # beginnings of the parameters that change the load
+ANY = -1.0  # rad: whatever the arm moved, it is too much
+CARRIED = ("wearer.", "payload.")  # beginnings of the parameters of what an arm may carry
+LOAD = ("mode", "support", *CARRIED)  # and of those that change the load
 MODES = {"one_g": "One-G", "zero_g": "Zero-G"}
 TIMESTAMP = re.compile(r"_\d{8}_\d{6}$")  # which `trial` adds to the script's name
 
@@ -56,7 +58,7 @@ CAPTIONS = {
 }
 
 SCREEN = html.Print()
-Worst = tuple[bool, float, str]  # whether it is worse than a small drift; rad; a sentence
+Found = tuple[bool, float, str]  # whether it is worse than a small drift; rad; a clause
 
 
 @dataclass(frozen=True)
@@ -98,9 +100,11 @@ class Conditions:
         """Mode, support, and the wearer whose arm Zero-G carries."""
         mode = self.history("mode", lambda mode: MODES.get(mode, mode))
         support = self.history("support", lambda share: f"{100.0 * share:g} %")
-        mass, body_mass = sum(self.start.get("wearer.mass", ())), self.start.get("wearer.body_mass", 0.0)
-        body = f"{body_mass:g} kg, {self.start['wearer.sex']}" if body_mass else "no data"
-        wearer = f"arm of {mass:.2f} kg" if mass else body
+        body = self.history("wearer.body_mass", lambda mass: f"{mass:g} kg" if mass else "no data")
+        last = self.at(math.inf)
+        wearer = f"{body}, {last['wearer.sex']}" if last.get("wearer.body_mass") else body
+        if any(last.get("wearer.mass", ())):
+            wearer = self.history("wearer.mass", lambda mass: f"arm of {sum(mass):.2f} kg")
         return mode, "none in One-G" if mode == "One-G" else support, wearer
 
 
@@ -118,8 +122,8 @@ class Report:
 
     @cached_property
     def failures(self) -> list[str]:
-        """One sentence for each way in which an arm did not hold."""
-        return [sentence for arm in self.arms for sentence in failures(*arm, self.criteria)]
+        """One clause for each way in which an arm did not hold."""
+        return [clause for arm in self.arms for is_bad, _, clause in _judged(self, *arm) if is_bad]
 
     @property
     def exit_code(self) -> int:
@@ -129,7 +133,8 @@ class Report:
     @cached_property
     def verdict(self) -> tuple[str, bool]:
         """The first sentences of the report, and whether they are good news: a bad event comes first."""
-        bad, moved, event = max((event for arm in self.arms for event in _events(self, *arm)), default=(False, 0.0, ""))
+        found = chain.from_iterable((*_judged(self, *arm), *_happened(self, *arm)) for arm in self.arms)
+        bad, moved, event = max(found)
         held = "It held, as far as it was recorded." if self.bag.is_partial else "It held."
         if self.failures:
             held = f"It did not hold.{f' The trial ended early: {self.trouble}.' if self.trouble else ''}"
@@ -140,8 +145,7 @@ class Report:
         first = f"{event[:1].upper()}{event[1:]}."
         if bad:
             return f"{first} {held if self.failures else held.replace('It ', 'Otherwise it ', 1)}", False
-        worst = f" Worst: {event}." if moved else f" {first}"
-        return f"{held}{worst if event else ''}", not self.failures
+        return f"{held} {f'Worst: {event}.' if moved else first}", True
 
     @property
     def title(self) -> str:
@@ -167,44 +171,65 @@ class Report:
         return {**of_whom, **settings, "version": session.version}
 
 
-def _events(report: Report, recording: Recording, analysis: TrialAnalysis) -> Iterator[Worst]:
-    """Yield how far each hold strayed, and each let-down and motion that the script does not explain."""
-    conditions, steps, time = report.settings[recording.name], recording.steps, recording.time
+def _judged(report: Report, recording: Recording, analysis: TrialAnalysis) -> Iterator[Found]:
+    """Yield what decides whether the arm held, which it did unless something is bad: holds, slips and releases."""
+    criteria, cause = report.criteria, report.settings[recording.name].change_before
+    if not analysis.holds:
+        never = "carried" if recording.carried == () else "still for long enough to count as a hold"
+        yield True, 0.0, f"{recording.name}: the arm was never {never}"
+    for number, hold in enumerate(analysis.holds, 1):
+        if hold.stray.max() > table.UNMOVED:
+            yield _found(recording, f"within 10 s of hold {number}, ", hold.stray, criteria.stray_allowed(hold))
+        else:
+            yield False, 0.0, f"{recording.name}: {table.unmoved(hold)}"
+        if hold.duration >= criteria.rated_from and np.abs(hold.drift_rate).max() > criteria.max_rate:
+            what, rate = f"by its drift in hold {number}, ", 60.0 * np.abs(hold.drift_rate)
+            yield _found(recording, what, rate, 60.0 * criteria.max_rate, unit="degrees per minute")
+    for motion in analysis.motions:
+        if motion.kind in MOVED:
+            what = f"{MOVED[motion.kind]} at {motion.start:.1f} s{cause(motion.start)}: "
+            yield _found(recording, what, np.abs(motion.peak), criteria.max_stray, motion.speed)
+    for release in analysis.releases:
+        if not (release.still and criteria.stayed(release)):
+            how = "did not stay where it was let go" if release.still else "was still moving at the end of a hold"
+            what = f"{how}, {release.start:.1f}-{release.end:.1f} s{cause(release.start)}: "
+            yield _found(recording, what, np.abs(release.offset), criteria.max_offset if release.still else ANY)
+
+
+def _happened(report: Report, recording: Recording, analysis: TrialAnalysis) -> Iterator[Found]:
+    """Yield each let-down that was not planned, and what moved after a change of load, without a script."""
+    cause, steps, time = report.settings[recording.name].change_before, recording.steps, recording.time
     spans, planned = recording.carried or (), (steps[-1].end if steps else time[-1]) - EARLY
     for (_, end), (again, _) in zip(spans, (*spans[1:], (time[-1], 0.0)), strict=False):
         fault = _fault_near(report.bag, recording.name, end)
         is_planned = end >= planned or (not steps and end == spans[-1][1])
         if end < time[-1] - EARLY and (fault or not is_planned):
-            within = (time >= end) & (time <= again)
-            moved = recording.position[within] - recording.position[within][0]
+            first, beyond = np.searchsorted(time, (end, again), "right")
+            within = slice(max(0, first - 1), beyond + 1)  # nothing may have been recorded in between
+            moved = recording.position[within] - recording.position[within.start]
             peak, speed = np.abs(moved).max(axis=0), np.abs(recording.velocity[within]).max(axis=0)
-            what = f"let down at {end:.1f} s{f' ({fault})' if fault else ''}{conditions.change_before(end)}: "
-            yield _event(recording, what, peak, True, speed)
+            what = f"let down at {end:.1f} s{f' ({fault})' if fault else ''}{cause(end)}: "
+            yield _found(recording, what, peak, ANY, speed)
     for motion in analysis.motions:
-        change = conditions.change_before(motion.start)
-        if motion.kind in MOVED or (motion.kind in ("push", "move") and not steps and change):
-            bad = bool(np.max(np.abs(motion.peak)) > report.criteria.max_stray)
-            what = f"{MOVED.get(motion.kind, 'moved')} at {motion.start:.1f} s{change}: "
-            yield _event(recording, what, np.abs(motion.peak), bad, motion.speed)
-    for release in analysis.releases:
-        if not (release.still and report.criteria.stayed(release)):
-            how = "did not stay where it was let go" if release.still else "was still moving at the end of a hold"
-            what = f"{how}, {release.start:.1f}-{release.end:.1f} s{conditions.change_before(release.start)}: "
-            yield _event(recording, what, np.abs(release.offset), True)
-
-    for number, hold in enumerate(analysis.holds, 1):
-        if hold.stray.max() > table.UNMOVED:
-            bad = bool(hold.stray.max() > report.criteria.stray_allowed(hold))
-            yield _event(recording, f"within 10 s of hold {number}, ", hold.stray, bad)
-        else:
-            yield False, 0.0, f"{recording.name}: {table.unmoved(hold)}"
+        if motion.kind in ("push", "move") and not steps and (change := cause(motion.start)):
+            what = f"moved at {motion.start:.1f} s{change}: "
+            yield _found(recording, what, np.abs(motion.peak), report.criteria.max_stray, motion.speed)
 
 
-def _event(recording: Recording, what: str, angle: np.ndarray, bad: bool, speed: np.ndarray | None = None) -> Worst:
+def _found(
+    recording: Recording,
+    what: str,
+    angle: np.ndarray,
+    most: float,
+    speed: np.ndarray | None = None,
+    unit: str = "degrees",
+) -> Found:
+    """Return what happened, with the joint that moved most. most: rad that are allowed."""
     joint = int(np.argmax(angle))
     fast = "" if speed is None else f", at up to {table.shown(math.degrees(speed[joint]), 0)} deg/s"
-    moved = f"{table.joint_labels(recording)[joint]} moved {table.shown(math.degrees(angle[joint]), 2)} degrees{fast}"
-    return bad, float(angle[joint]), f"{recording.name}: {what}{moved}"
+    limit = f", more than {table.shown(math.degrees(most), 2)}" if angle[joint] > most > ANY else ""
+    moved = f"{table.joint_labels(recording)[joint]} moved {table.shown(math.degrees(angle[joint]), 2)} {unit}"
+    return bool(angle[joint] > most), float(angle[joint]), f"{recording.name}: {what}{moved}{limit}{fast}"
 
 
 def _fault_near(bag: Bag, arm: str, time: float) -> str:
@@ -229,6 +254,9 @@ def analyse(bag: Bag, criteria: HoldCriteria | None = None, min_hold: float = MI
     for recording in bag.recordings:
         try:
             if part := wearer_of(bag, recording):
+                for time, changed, _ in settings[recording.name].changes:
+                    if changed.startswith(CARRIED):  # the model is that of the start
+                        raise DataError(f"{changed} was changed at {time:.1f} s")
                 wearers[recording.name] = part
         except (DataError, ParameterError) as error:
             notes.append(f"{recording.name}: the wearer's torque is not known: {error}")
@@ -284,11 +312,14 @@ def write(
                 drawn["drift"] = figures.drift(recording, analysis, report.criteria)
             if shared := report.wearers.get(recording.name):
                 drawn["wearer"] = figures.wearer(recording, shared)
-            pictures = []
-            for name, figure in drawn.items():
-                path = folder / f"{recording.name.replace('/', '_')}_{name}.png"
-                written += [path, *(path.with_suffix(f".{suffix}") for suffix in on_paper.formats)]
-                pictures.append(html.picture(html.saved(figure, path, STAMPS[source], on_paper), CAPTIONS[name]))
+            pictures, stem = [], recording.name.replace("/", "_")
+            for name, caption in CAPTIONS.items():
+                path = folder / f"{stem}_{name}.png"
+                path.unlink(missing_ok=True)  # of an earlier report
+                if name in drawn:
+                    written += [path, *(path.with_suffix(f".{suffix}") for suffix in on_paper.formats)]
+                    png = html.saved(drawn[name], path, STAMPS[source], on_paper)
+                    pictures.append(html.picture(png, caption))
             if text := figures.stayed_text(recording, analysis):
                 pictures.append(html.bullets("", [text]))
             if shared:

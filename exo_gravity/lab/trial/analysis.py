@@ -356,36 +356,3 @@ class HoldCriteria:
     def stayed(self, release: Release) -> bool:
         """Return whether the arm stayed where it was let go; after a push it may move."""
         return release.after == "push" or bool(np.max(np.abs(release.offset)) <= self.max_offset)
-
-
-def failures(recording: Recording, trial: TrialAnalysis, criteria: HoldCriteria) -> list[str]:
-    """Return one sentence for each criterion that the arm failed; an empty list if it held."""
-    found = []
-    if not trial.holds:
-        never = "carried" if recording.carried == () else "still for long enough to count as a hold"
-        found.append(f"the arm was never {never}")
-    for hold in trial.holds:
-        most = criteria.stray_allowed(hold)
-        for name, stray, rate in zip(recording.joint_names, hold.stray, hold.drift_rate, strict=True):
-            where = f"{hold.start:.1f}-{hold.end:.1f} s: {name}"
-            if stray > most:
-                found.append(f"{where} strayed {_degrees(stray)} within 10 s, more than {_degrees(most)}")
-            if abs(rate) > criteria.max_rate and hold.duration >= criteria.rated_from:
-                per_minute, allowed = _degrees(60.0 * rate), _degrees(60.0 * criteria.max_rate)
-                found.append(f"{where} drifted {per_minute} per minute, more than {allowed}")
-    for motion in trial.motions:
-        peak = np.max(np.abs(motion.peak))
-        if motion.kind in MOVED and peak > criteria.max_stray:
-            where = f"{motion.start:.1f}-{motion.end:.1f} s: the arm"
-            found.append(f"{where} {MOVED[motion.kind]} by {_degrees(peak)}")
-    for release in trial.releases:
-        where = f"{release.start:.1f}-{release.end:.1f} s: the arm"
-        if not release.still:
-            found.append(f"{where} was still moving at the end of a hold")
-        elif not criteria.stayed(release):
-            found.append(f"{where} moved {_degrees(np.max(np.abs(release.offset)))} from where it was let go")
-    return [f"{recording.name}: {sentence}" for sentence in found]
-
-
-def _degrees(angle: float) -> str:
-    return f"{math.degrees(angle):.2f} degrees"

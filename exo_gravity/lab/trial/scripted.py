@@ -2,6 +2,7 @@
 """What is asked of a trial by its script: how long and how still the arm must be held."""
 
 import math
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -51,4 +52,6 @@ def analysed(bag: "Bag", script: TrialScript, guided: bool, trouble: str) -> tup
     # A real arm's recording has no script, so a hold in which the arm never came to rest leaves no other trace.
     found = {recording.name: len(analysis.holds) for recording, analysis in report.arms}
     missing = [f"{arm}: {count} of {len(holds)} holds were found" for arm, count in found.items() if count < len(holds)]
-    return report, missing[0] if guided and missing and not trouble else trouble
+    if not guided or trouble or not missing:
+        return report, trouble
+    return replace(report, notes=(*report.notes, *missing)), missing[0]
