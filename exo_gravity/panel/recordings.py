@@ -15,7 +15,7 @@ import os
 import re
 import shutil
 from asyncio.subprocess import DEVNULL, PIPE
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from datetime import datetime
 from pathlib import Path
 from typing import Any
@@ -85,6 +85,7 @@ class Recordings:
             "foreign": not is_on and RECORDER in self._device.parameters(),
             "folder": str(self._folder or "") if is_on else "",
             "seconds": round(self._clock() - self._began) if is_on else 0,
+            "problem": self._ending(self._recorder) if self._recorder and not is_on else "",
         }
         folder = str(self._output / self._present["subject"])
         session = {**self._present, "folder": folder, "wearer": self._wearer}
@@ -117,8 +118,7 @@ class Recordings:
         if launcher is None:
             return "nothing is being recorded"
         await asyncio.to_thread(launcher.stop)
-        code = launcher.exit_code(RECORDER)
-        return f"the recorder ended with exit code {code}: see {self._folder}/recorder.log" if code else ""
+        return self._ending(launcher) if launcher.exit_code(RECORDER) else ""
 
     async def save(self) -> str:
         """Write the parameters in force as YAML, from which `launcher` starts."""
@@ -151,18 +151,10 @@ class Recordings:
         guided = not any(node.endswith("/simulator") for node in self._device.parameters())
         attach = ("--attach", "guided" if guided else "simulated", "--output", str(self._output))
         words = [str(path), *attach, *(f"--{key}={text}" for key, text in self._present.items())]
-        self._trial = await asyncio.create_subprocess_exec(
-            *program("exo_gravity.tools.trial", "trial"),
-            *words,
-            stdin=DEVNULL,
-            stdout=PIPE,
-            stderr=PIPE,
-            start_new_session=True,
-        )
         steps = [{"action": s.action, "value": list(s.value), "duration": s.duration} for s in script.steps]
         self._progress = {"phase": "running", "name": script.name, "guided": guided, "steps": steps, "step": -1}
-        self._folder, self._began = None, self._clock()
-        self._following = asyncio.create_task(self._follow(self._trial, "" if guided else str(path)))
+        self._folder, self._began, self._recorder, self._trial = None, self._clock(), None, None
+        self._following = asyncio.create_task(self._follow(words, "" if guided else str(path)))
         return ""
 
     async def stop_trial(self) -> str:
@@ -172,8 +164,16 @@ class Recordings:
         self._trial.terminate()
         return ""
 
-    async def _follow(self, trial: asyncio.subprocess.Process, script: str) -> None:
-        """Follow the trial's lines to its report; the virtual wearers perform `script`, '' for none, until it ends."""
+    async def _follow(self, words: Sequence[str], script: str) -> None:
+        """Start a trial, and follow its lines to its report; the virtual wearers perform `script`, '' for none."""
+        trial = self._trial = await asyncio.create_subprocess_exec(
+            *program("exo_gravity.tools.trial", "trial"),
+            *words,
+            stdin=DEVNULL,
+            stdout=PIPE,
+            stderr=PIPE,
+            start_new_session=True,
+        )
         assert trial.stdout and trial.stderr
         errors = asyncio.create_task(trial.stderr.read())
         refused, performs = "", False
@@ -196,7 +196,8 @@ class Recordings:
         name, problem = self._progress["name"], refused or self._progress.get("problem", "")
         problem = problem or (lines[-1] if failed and lines else "")
         key = self._key(self._folder, REPORT) if self._folder else ""
-        self._progress = {"phase": "done", "name": name, "problem": problem, "report": key}
+        is_stopped = self._progress.get("stopped", False)
+        self._progress = {"phase": "done", "name": name, "problem": problem, "stopped": is_stopped, "report": key}
         self._note(f"trial {name} has ended: {problem or 'done'}")
 
     async def session(self, **present: str) -> str:
@@ -283,6 +284,9 @@ class Recordings:
 
     def _is_recording(self) -> bool:
         return self._recorder is not None and self._recorder.exit_code(RECORDER) is None
+
+    def _ending(self, recorder: Launcher) -> str:
+        return f"the recorder ended with exit code {recorder.exit_code(RECORDER)}: see {self._folder}/recorder.log"
 
     def _is_in_trial(self) -> bool:
         return self._following is not None and not self._following.done()

@@ -7,7 +7,7 @@ of the recorder lets the arm down, and the trial reports what was recorded until
 
 With --attach it starts the recorder alone, for arms that are carried already: the operator's panel runs its trials so.
 It then prints one JSON object per line: {"folder": PATH}; ten times a second while it records {"step": -1.., "left": s}
-after the script {"phase": "reporting"}; last {"problem": TEXT}, '' for none.
+after the script {"phase": "reporting"}; last {"problem": TEXT, "stopped": whether that is the operator}, '' for none.
 
 Exit code 0: the arm held. 1: it did not hold, or the trial did not finish. 2: wrong use or wrong file.
 """
@@ -40,7 +40,7 @@ def _run(options: argparse.Namespace, params: Path, clip: video.Clip | None, con
     """Run and report a trial; return the exit code. Raises ExoGravityError."""
     from exo_gravity.lab.bag.reader import read_bag
     from exo_gravity.lab.report import trial_report
-    from exo_gravity.lab.trial.run import Trial, check_bridges, run_trial
+    from exo_gravity.lab.trial.run import STOPPED, Trial, check_bridges, run_trial
 
     path, script = read_script(options.name)
     session, now = Session(options.subject, options.protocol, options.note, version()), datetime.now()
@@ -76,7 +76,7 @@ def _run(options: argparse.Namespace, params: Path, clip: video.Clip | None, con
     console.print(f"Report, recording{log} and parameters: {folder}", markup=False, soft_wrap=True)
     if trouble:
         console.print(f"trial: {trouble}", markup=False, soft_wrap=True)
-    tell(problem=trouble)
+    tell(problem=trouble, stopped=trouble == STOPPED)
     return code
 
 

@@ -199,10 +199,15 @@ def test_a_recorder_whose_launcher_died_records_until_the_arm_is_down(arm, tmp_p
     assert (tmp_path / "bag" / "metadata.yaml").exists()
 
 
-def test_a_step_that_is_no_json_leaves_the_rest_of_the_live_line(capsys):
+def test_the_live_line_has_no_step_that_is_no_json_and_no_status_of_a_node_that_has_died(capsys, monkeypatch):
     live = LiveLine()
+    with monkeypatch.context() as before:
+        before.setattr(time, "monotonic", lambda: -3.1)
+        live.note(
+            "/diagnostics", serialize_message(DiagnosticArray(status=[DiagnosticStatus(name="right/can_bridge")]))
+        )
     live.note("/right/wearer_step", serialize_message(String(data="no JSON")))
     live.note("/right/joint_states", serialize_message(JointState(name=NAMES, position=[1.0] * 4)))
     live.write({"messages": 2, "lost": 0})
     line = json.loads(capsys.readouterr().out)
-    assert line["right"]["position"] == [1.0] * 4 and "step" not in line["right"]
+    assert line["right"]["position"] == [1.0] * 4 and "step" not in line["right"] and not line["status"]

@@ -492,6 +492,8 @@ def test_recording_trial_and_parameters_are_asked_for_and_markers_set_by_button_
     steps = [{"action": "move", "value": [0.0, 0.5, 0.6, 0.5]}]
     stage.files.content["trial"] = {"phase": "running", "name": "reach", "steps": steps, "step": 0, "left": 2.0}
     wait_for_text(page, "#trial-step", "Shoulder flexion 34°, Elbow flexion 29°")
+    stage.files.content["recording"] = {"on": False, "foreign": False, "problem": "the recorder ended"}
+    wait_for_text(page, "#recording-text", "The recording has ended early: the recorder ended")
     page.click("#save")
     wait_until(page, lambda: "save" in stage.files.calls)
     assert stage.files.calls == [
@@ -568,7 +570,14 @@ def test_the_page_is_german_when_its_user_or_their_browser_wants_it(page, browse
     page.select_option("#language", "de")
     wait_for_text(page, of_arm(".sentence"), "Ellenbogen Beugung: um 0,1° zurückdrehen.")
     page.click(of_arm(".home"))
-    wait_for_text(page, "#message", "Das Gerät sagt auf Englisch: „the bus is gone“")
+    wait_for_text(page, "#message", "Das Gerät sagt auf Englisch: „refused: the bus is gone“")
+    stage.files.content["trial"] = {
+        "phase": "done",
+        "name": "reach",
+        "problem": "stopped by the operator",
+        "stopped": True,
+    }
+    wait_for_text(page, "#trial-text", "reach wurde abgebrochen.")
     texts = page.inner_text("body")
     assert not re.search(r"\b(Let down|Enable|Clear fault|Wearer|Recording)\b", texts)
     assert "Rumpf: 11,5° nach vorn, 5,7° nach links" in texts and "4,1 ms. Gedämpft durch: still joint (elbow)" in texts

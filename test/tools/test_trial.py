@@ -249,7 +249,7 @@ class Screen(TrialScreen):
         """Process a line of the recorder at `now`, in which the bridge has the status `bridge`; return the screen."""
         self.now = now
         faults = [bridge["message"]] if bridge["level"] else []
-        arm = {"position": list(position), "effort": [0.0] * 4, **arm}
+        arm = {"names": list("abcd"), "position": list(position), "effort": [0.0] * 4, **arm}
         self.take(json.dumps({"right": arm, "status": {name: bridge}, "faults": faults}))
         with self.console.capture() as capture:
             self.console.print(self.screen())
@@ -257,7 +257,7 @@ class Screen(TrialScreen):
 
     @property
     def printed(self):
-        return [line[5:] for line in self.out.getvalue().splitlines()]
+        return [line[5:] for line in self.out.getvalue().splitlines() if "joints in order: a, b, c, d" not in line]
 
     def end_of_trial(self, exit_code=None, stopped=None):
         return self.wait(stopped or threading.Event(), lambda: exit_code, Future())
@@ -283,9 +283,12 @@ def test_the_clock_leads_a_person_through_the_steps():
         screen.at(now)
     assert "then: hands off for 4 s" in screen.at(LEAD + 1.0)
     assert "then: done" in screen.at(LEAD + 2.1) and not screen.done
-    screen.at(LEAD + 6.1)
+    screen.at(LEAD + 3.0)
+    screen.at(LEAD + 3.1, (0.9,), names=["finger"])  # of a gripper, on the same topic
+    assert "drift 0.57 deg" in screen.at(LEAD + 5.9, (0.01, 0.0, 0.0, 0.0))
+    screen.at(LEAD + 6.1, (0.01, 0.0, 0.0, 0.0))
     assert screen.done
-    assert screen.printed == ["bring the arm to 6 34 69 29 deg, then let go", "hands off for 4 s"]
+    assert screen.printed == ["bring the arm to 6 34 69 29 deg, then let go", "hands off for 4 s", "drifted 0.57 deg"]
 
 
 WEARERS_MOVE = "the wearer brings the arm to 6 34 69 29 deg"

@@ -38,7 +38,7 @@ from exo_gravity.lab.bag.writer import BagWriter, Message, offered_qos
 from exo_gravity.lab.inputs.arms import node_values, read_arm
 from exo_gravity.lab.inputs.parameter_file import load, node_of
 from exo_gravity.lab.trial.analysis import ARRAYS, CARRIED, Recording, ScriptedStep, Span
-from exo_gravity.lab.trial.run import GRACE, Trial, TrialEnd
+from exo_gravity.lab.trial.run import GRACE, STOPPED, Trial, TrialEnd
 from exo_gravity.sim.controllers import DirectController
 from exo_gravity.sim.device import SimulatedDevice, VirtualWearer
 from exo_gravity.sim.params import device_of, imu_of, set_faults, simulator_table
@@ -114,7 +114,7 @@ class OfflineTrial:
             if now >= second:
                 second += 1.0
                 if should_stop(now) and not self.trouble:
-                    self._abort(now, "stopped by the operator")
+                    self._abort(now, STOPPED)
             if self._start == math.inf and safety.state in CARRYING:  # the motors are on
                 self.arm.device.start(self.wearer, self._delay)
                 self._start = now + self._delay
@@ -226,6 +226,8 @@ def record_offline(trial: Trial, console: Console, should_stop: Callable[[], boo
     recordings = []
     with Progress(console=console, transient=True, disable=not console.is_terminal) as progress:
         for one in simulated:
+            if recordings and should_stop():
+                break  # of an arm that is stopped at once nothing is recorded
             task = progress.add_task(one.arm.name, total=one.script.duration)
 
             def on_second(now: float, task: TaskID = task) -> bool:

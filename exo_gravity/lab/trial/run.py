@@ -32,6 +32,7 @@ from exo_gravity.lab.processes import Launcher, Stopping
 from exo_gravity.sim.script import Step, TrialScript
 
 SETTLING = 0.5  # s between letting go and the position from which drift is measured
+STOPPED = "stopped by the operator"
 LEAD = 5.0  # s for a person to get ready when the arm is carried
 BRIDGE_TIMEOUT = 5.0  # s from the recorder's first line, in which a bridge that runs already has reported ten times
 
@@ -72,7 +73,7 @@ class TrialScreen:
         self._step_start = self._last_line = self.clock()
         self._first_line = math.inf
         self._start = math.inf  # of a script that the clock leads
-        self._origin: dict[str, list[float]] = {}  # position of each arm from which drift is measured
+        self._origin: dict[tuple[str, str], float] = {}  # rad, of arm and joint, from which drift is measured
         self._ending = ""
         #: shows `screen` on a terminal, and nothing elsewhere
         self.live = Live(
@@ -140,7 +141,7 @@ class TrialScreen:
                 return "an arm is not active any more"
             if time.monotonic() > deadline:
                 return f"the trial did not finish in time: {'; '.join(self.faults) or 'no node reports a fault'}"
-        return "stopped by the operator" if stopped.is_set() else ""
+        return STOPPED if stopped.is_set() else ""
 
     @property
     def _step(self) -> Step | None:
@@ -180,17 +181,18 @@ class TrialScreen:
                 number = f"{index + 1}/{len(self.script.steps)}"
                 self.console.print(f"{number:<5}{describe(self._step, self.guided)}", soft_wrap=True)
         elif not self._origin and now - self._step_start > SETTLING and self._step and self._step.action == "hold":
-            self._origin = {name: arm["position"] for name, arm in self._arms.items()}
+            self._origin = self._angles()
         self.done = index >= len(self.script.steps)
 
     def _drift(self) -> float:
         """Return the largest drift of any joint since it was let go, in degrees."""
-        moved = (
-            abs(now - then)
-            for name, origin in self._origin.items()
-            for now, then in zip(self._arms.get(name, {"position": origin})["position"], origin, strict=True)
-        )
+        moved = (abs(now - self._origin.get(joint, now)) for joint, now in self._angles().items())
         return math.degrees(max(moved, default=0.0))
+
+    def _angles(self) -> dict[tuple[str, str], float]:
+        """Return the angle of each arm's joints in rad: others may publish joint states there, too."""
+        named = {name: zip(arm["names"], arm["position"], strict=False) for name, arm in self._arms.items()}
+        return {(name, joint): angle for name, joints in named.items() for joint, angle in joints}
 
     def screen(self) -> Group:
         """Return the changing part of the screen: time left, drift, next step, each arm, warnings and errors."""
@@ -324,14 +326,14 @@ def run_trial(trial: Trial, console: Console, stopped: Stopping, on_progress: Ca
         while screen.is_falling and screen.silence < 1.0 and time.monotonic() < down_by and not nodes.done():
             time.sleep(0.05)  # the recording shows how the arm comes down
         if not nodes.done():
-            screen.end("letting the arm down and closing the recording")
+            screen.end(f"{'letting the arm down and ' if trial.params else ''}closing the recording")
         ending.set()
     if dead := nodes.result():
         node, code = dead
         trouble = f"{node.lstrip('/')} ended with exit code {code}: {last_errors.get(node, f'see {path}')}"
         return TrialEnd(trouble, 2 if code == 2 else 1)
-    if not trouble:
-        return TrialEnd()
+    if trouble in ("", STOPPED):
+        return TrialEnd(trouble, int(bool(trouble)))
     recorder = f": {last_errors[RECORDER]}" if RECORDER in last_errors else ""
     return TrialEnd(f"{trouble}{recorder}{stall_of(screen.status)}", 1)
 

@@ -58,6 +58,7 @@ class RecorderTiming:
     drain_period: float = 0.05  #: s between two writes of what has arrived
     discovery_period: float = 0.5  #: s between two searches for new topics
     live_period: float = 0.1  #: s between two lines of live state, and two searches for new nodes
+    live_silence: float = 3.0  #: s without a status after which the live line has it no more: its node may have died
     loss_period: float = 5.0  #: s between two warnings of lost messages
     depth: int = 1000  #: queued messages per topic: two seconds at 500 Hz
     #: s without joint states, after which the arms are down: after the launcher's death a bridge lets its arm down, and
@@ -208,12 +209,13 @@ class LiveLine:
     "step": {...}}, "status": {"right/can_bridge": {"level": 2, "message": "...", "state": "fault", ...}},
     "faults": ["right/can_bridge: ..."], "recorder": {"messages": 1000, "lost": 0}}
 
-    status: the newest of each node on /diagnostics, its values included. faults: those whose level is not OK.
+    status: the newest of each node on /diagnostics that still reports, its values included. faults: those whose
+    level is not OK.
     """
 
     def __init__(self) -> None:
         self._latest: dict[str, bytes] = {}
-        self._status: dict[str, dict[str, Any]] = {}
+        self._status: dict[str, tuple[float, dict[str, Any]]] = {}  # monotonic s of its arrival, and its values
 
     def note(self, topic: str, data: bytes) -> None:
         """Keep the newest message of a topic, and the newest status of each node."""
@@ -221,7 +223,7 @@ class LiveLine:
             self._latest[topic] = data
         elif topic == content.DIAGNOSTICS:
             for status in deserialize_message(data, DiagnosticArray).status:
-                self._status[status.name] = status_values(status)
+                self._status[status.name] = time.monotonic(), status_values(status)
 
     def write(self, recorder: dict[str, int]) -> None:
         """Write the line to standard output."""
@@ -237,8 +239,10 @@ class LiveLine:
             else:
                 arm["names"] = list(message.name)
                 arm |= {field: list(getattr(message, field)) for field in ("position", "velocity", "effort")}
-        faults = [f"{name}: {status['message']}" for name, status in self._status.items() if status["level"]]
-        line |= {"recorder": recorder, "status": self._status, "faults": faults}
+        oldest = time.monotonic() - TIMING.live_silence
+        status = {name: values for name, (arrived, values) in self._status.items() if arrived > oldest}
+        faults = [f"{name}: {values['message']}" for name, values in status.items() if values["level"]]
+        line |= {"recorder": recorder, "status": status, "faults": faults}
         sys.stdout.write(json.dumps(line) + "\n")
         sys.stdout.flush()
 

@@ -62,7 +62,7 @@ async function send(body, done = "") {
   sent += 1;
   const turn = sent;
   const problem = await request(body);
-  if (problem !== "" || turn === sent) say(problem === null ? t("unsent") : problem ? t("refused", problem.replace(/^refused: /, "")) : done);
+  if (problem !== "" || turn === sent) say(problem === null ? t("unsent") : problem ? t("refused", problem) : done);
   return problem === "";
 }
 

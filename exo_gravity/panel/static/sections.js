@@ -276,12 +276,14 @@ function takeSpace(event) {
 
 function recordingText(recording) {
   if (recording.foreign) return t("recording.foreign");
+  if (recording.problem) return t("recording.problem", recording.problem);
   return recording.on ? t("recording.on", recording.seconds, recording.folder) : t("recording.off");
 }
 
 function trialText(trial) {
   if (trial.phase === "running" && trial.step >= 0) return t("trial.running", trial.name, Math.min(trial.step + 1, trial.steps.length), trial.steps.length, Math.round(trial.left ?? 0));
   if (trial.phase === "running") return t("trial.ready", trial.name, Math.round(trial.left ?? 0));
+  if (trial.phase === "done" && trial.stopped) return t("trial.stopped", trial.name);
   if (trial.phase === "done" && trial.problem) return t("trial.problem", trial.name, trial.problem);
   return t(`trial.${trial.phase}`, trial.name);
 }
