@@ -473,8 +473,13 @@ class _Contents:
         return np.full((len(clock), len(names)), np.nan, np.float32)
 
     def _script(self, arm: str) -> tuple[ScriptedStep, ...]:
-        """Return the script steps of an arm; each ends when the next one begins, at the latest."""
+        """Return the script steps of an arm; each ends when the next one begins, at the latest.
+
+        A simulator repeats its newest step to a recorder that starts later: the end of a script is no script.
+        """
         steps = [(at, action, duration) for at, (_, action, duration) in self.in_order(self._steps.get(arm, []))]
+        if all(action == "done" for _, action, _ in steps):
+            return ()
         ends = [*(begin for begin, _, _ in steps[1:]), math.inf]
         return tuple(ScriptedStep(name, at, min(at + s, end)) for (at, name, s), end in zip(steps, ends, strict=False))
 
