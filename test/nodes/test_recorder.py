@@ -161,7 +161,7 @@ def test_parameters_their_changes_session_and_markers_are_recorded_and_shown_liv
     assert 0.0 < bag.markers[0].time <= bag.recordings[0].time[-1] + 1.0
     line = json.loads(session[1][-1])
     assert line["right"]["names"] == NAMES and line["right"]["position"] == [STEP * (COUNT - 1)] * 4
-    assert line["right"]["command"] == [float(COUNT - 1)] * 4 and line["right"]["step"]["action"] == "hold"
+    assert line["right"]["effort"] == [1.0] * 4 and line["right"]["step"]["action"] == "hold"
     assert line["faults"] == ["right/bridge: motor 2 is silent"]
 
 
@@ -208,6 +208,6 @@ def test_the_live_line_has_no_step_that_is_no_json_and_no_status_of_a_node_that_
         )
     live.note("/right/wearer_step", serialize_message(String(data="no JSON")))
     live.note("/right/joint_states", serialize_message(JointState(name=NAMES, position=[1.0] * 4)))
-    live.write({"messages": 2, "lost": 0})
+    live.write()
     line = json.loads(capsys.readouterr().out)
     assert line["right"]["position"] == [1.0] * 4 and "step" not in line["right"] and not line["status"]

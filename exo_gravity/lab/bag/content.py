@@ -168,10 +168,7 @@ def _columns(recording: Recording, source: Source) -> dict[str, np.ndarray]:
     for number, one in enumerate(recording.steps, 1):
         within = slice(*np.searchsorted(time, (one.start, one.end)))
         step[within], action[within] = number, one.action
-    carried = np.zeros(len(time), bool)
-    for start, end in recording.while_carried(-np.inf, np.inf):
-        carried |= (start <= time) & (time <= end)
-    shared = {"time_s": time, "step": step, "action": action, "carried": carried}
+    shared = {"time_s": time, "step": step, "action": action, "carried": recording.is_carried}
     values = (recording.position, recording.velocity, recording.effort, recording.command)
     names = ("position_rad", "velocity_rad_per_s", "torque_nm", "command_nm")
     return {

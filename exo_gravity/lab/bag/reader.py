@@ -168,7 +168,6 @@ def efforts_in_force(sent: np.ndarray, effort: np.ndarray, clock: np.ndarray) ->
 MAX_ANGLE = 2.0 * math.pi  # rad; no joint of an arm turns farther
 MAX_SHARE = 0.01  # of the samples that may be beyond it, and are left out: more are of another unit
 STATE_GAP = 1.0  # s; can_bridge reports its state twice a second, except while it ends
-KNOWN = (Source.SIMULATED, Source.REAL)
 LISTED = 20  # in a sentence: a robot's recording may have hundreds of topics
 
 Row = tuple[int, int]  # number of a message in the recording, time of arrival in ns
@@ -398,7 +397,7 @@ class _Contents:
                 self._states.setdefault(arm_of(status.name), []).append((row, entry.value))
         if leaf(status.name) == "simulator":
             self.sources[arm_of(status.name)] = Source.SIMULATED
-        elif leaf(status.name) == BRIDGE and values.get("source") in KNOWN:
+        elif leaf(status.name) == BRIDGE and values.get("source") in (Source.SIMULATED, Source.REAL):
             self.sources.setdefault(arm_of(status.name), Source(values["source"]))
 
     def recording(self, topic: str, series: JointSeries) -> Recording | None:

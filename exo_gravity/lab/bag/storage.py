@@ -243,8 +243,6 @@ HEAD = struct.Struct("<BQHIQQ")  # of a message: the same, channel, sequence, ti
 MESSAGE = int(Opcode.MESSAGE)  # a plain number is faster to compare than an enumeration
 LARGEST = 256 * 2**20  # bytes of an MCAP record; more is damage
 BLOCK = 4_000  # messages at once
-TOPICS = "SELECT id, name, type FROM topics"
-MESSAGES = "SELECT topic_id, timestamp, data FROM messages WHERE topic_id IN"
 KINDS = (".mcap", ".db3")
 COMPRESSED = (".zstd", ".zst")  # ends of the names of files that rosbag2, or a person, compressed
 EXPECTED = (
@@ -379,9 +377,15 @@ class Storage:
         with tempfile.TemporaryDirectory() as folder, ExitStack() as stack:
             try:
                 database = stack.enter_context(closing(_opened(file, Path(folder))))
-                topics = {key: (str(topic), str(kind)) for key, topic, kind in database.execute(TOPICS)}
+                topics = {
+                    key: (str(topic), str(kind))
+                    for key, topic, kind in database.execute("SELECT id, name, type FROM topics")
+                }
                 chosen = {key: topic for key, topic in topics.items() if wanted(*topic)}
-                cursor = database.execute(f"{MESSAGES} ({','.join('?' * len(chosen))})", list(chosen))
+                cursor = database.execute(
+                    f"SELECT topic_id, timestamp, data FROM messages WHERE topic_id IN ({','.join('?' * len(chosen))})",
+                    list(chosen),
+                )
             except (sqlite3.Error, OSError, UnicodeDecodeError) as error:
                 reason = " ".join(str(error).split())  # it may quote several lines of a damaged file
                 way = f"copy {file.name}-wal, too, if there is one, or recover it by `sqlite3 {file.name} .recover`"

@@ -127,11 +127,11 @@ class Stage:
 
     def _draw_arm(self, arm: Described, recording: Recording, time: float) -> None:
         """Draw an arm, what is shown around it, and the torque of each joint at the picture's edge on its side."""
-        at = min(int(np.searchsorted(recording.time, time)), len(recording.time) - 1)
+        at = _sample(recording, time)
         rows = (recording.position, recording.velocity, recording.effort)
         theta, velocity, effort = (np.nan_to_num(row[at].astype(float)).tolist() for row in rows)
         powered = State.LETTING_DOWN if max(map(abs, effort)) > NO_TORQUE else State.DISABLED
-        state = State.ACTIVE if _is_carried(recording, time) else powered
+        state = State.ACTIVE if recording.is_carried[at] else powered
         origins = arm.pose(theta)[0]
         self._line(origins[1:], LIMB_SIZE, LIMB)
         self._line(origins, TUBE, COLOURS["tube"])
@@ -152,8 +152,8 @@ class Stage:
             )  # fmt: skip
 
 
-def _is_carried(recording: Recording, time: float) -> bool:
-    return any(start <= time <= end for start, end in recording.while_carried(-np.inf, np.inf))
+def _sample(recording: Recording, time: float) -> int:
+    return min(int(np.searchsorted(recording.time, time)), len(recording.time) - 1)
 
 
 def _step(recording: Recording, time: float) -> str:
@@ -161,7 +161,7 @@ def _step(recording: Recording, time: float) -> str:
     for step in recording.steps:
         if step.start <= time < step.end:
             return STEPS.get(step.action, step.action)
-    if _is_carried(recording, time):
+    if recording.is_carried[_sample(recording, time)]:
         return "carried"
     return "let down" if recording.carried and time > recording.carried[0][0] else "start-up checks"
 

@@ -75,8 +75,7 @@ def summary(path: str, criteria: HoldCriteria, min_hold: float, every: int) -> l
             "wearer_share": part and float(part.whole.value),
             "smoothness_sparc": smoothness(recording, analysis),
         }
-        spans = [slice(*np.searchsorted(recording.time, span)) for span in recording.while_carried(-math.inf, math.inf)]
-        carried = np.concatenate([recording.position[:0], *(recording.position[span] for span in spans)])
+        carried = recording.position[recording.is_carried]
         holds = analysis.holds
         for joint, name in enumerate(recording.joint_names):
             rates = [60.0 * np.degrees((h.drift_rate[joint], h.drift_rate_uncertainty[joint])) for h in holds]

@@ -96,7 +96,12 @@ def write_lerobot(folder: Path, bags: Iterable[Bag], rate: int) -> None:
             **{f"data/{key}": value for key, value in place.items()},
             "dataset_from_index": total, "dataset_to_index": total + count,
             "meta/episodes/chunk_index": 0, "meta/episodes/file_index": 0,
-            **{f"stats/{name}/{key}": x for name in frames for key, x in _statistics(frames[name]).items()},
+            **{f"stats/{name}/count": [count] for name in frames},
+            **{
+                f"stats/{name}/{key}": getattr(values, key)(axis=0).tolist()
+                for name, values in frames.items()
+                for key in ("min", "max", "mean", "std")  # by which LeRobot normalises
+            },
         })  # fmt: skip
         total += count
     columns = {key: [episode[key] for episode in episodes] for key in episodes[0]}
@@ -137,14 +142,6 @@ def _frames(bag: Bag, rate: int) -> tuple[dict[str, list[str]], dict[str, np.nda
                 columns.append(np.interp(time, arm.time[known], values[known]))
         frames[feature] = np.column_stack(columns)
     return names, frames
-
-
-def _statistics(values: np.ndarray) -> dict[str, list[float]]:
-    """Return what LeRobot normalises numbers (frames, k) by."""
-    return {
-        "count": [len(values)],
-        **{name: getattr(values, name)(axis=0).tolist() for name in ("min", "max", "mean", "std")},
-    }
 
 
 def _combined(columns: Mapping[str, Sequence[Any]], of: str) -> dict[str, list[float]]:

@@ -14,16 +14,13 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from matplotlib.figure import Figure
-from rich import box
 from rich.console import Console
-from rich.markup import escape
-from rich.table import Table
 from scipy import stats
 
 from exo_gravity.core.vocabulary import Source
 from exo_gravity.lab.report import html
 from exo_gravity.lab.report.cohort import Row
-from exo_gravity.lab.report.table import shown
+from exo_gravity.lab.report.table import print_table, shown
 from exo_gravity.lab.report.trial_report import MODES
 
 LEGEND = 10  # lines at most that a figure names
@@ -210,12 +207,7 @@ def summary_of(trials: Sequence[Row]) -> str:
 def print_trials(trials: Sequence[Row], tables: Iterable[Cells], console: Console) -> None:
     """Print the tables of `tables_of`, and what failed."""
     for title, heads, cells in tables:
-        table = Table(box=box.SIMPLE_HEAD, padding=(0, 1, 0, 0), pad_edge=False, title=title, title_justify="left")
-        for heading in heads:
-            table.add_column(heading)
-        for row in cells:
-            table.add_row(*map(escape, row))
-        console.print(table)
+        print_table(console, heads, cells, title)
     for problem in problems_of(trials):
         console.print(f"Not reported: {problem}", markup=False)
 

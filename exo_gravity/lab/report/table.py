@@ -10,7 +10,8 @@ from typing import Any, NamedTuple
 import numpy as np
 from rich import box
 from rich.console import Console
-from rich.table import Table
+from rich.markup import escape
+from rich.table import Column, Table
 
 from exo_gravity.lab.report import html
 from exo_gravity.lab.trial.analysis import Hold, Motion, Recording, TrialAnalysis
@@ -30,7 +31,7 @@ def per_minute(values: Any) -> Any:
 UNITS: dict[str, Callable[[Any], Any]] = {"deg": np.degrees, "deg/s": np.degrees, "deg/min": per_minute, "Nm": np.array}
 
 
-class Column(NamedTuple):
+class Quantity(NamedTuple):
     """A number of each joint in each hold or motion."""
 
     field: str  #: of Hold or Motion, (joints,)
@@ -62,7 +63,7 @@ class Kind(NamedTuple):
     title: str
     lead: Callable[[int, Any], dict[str, Any]]  #: number, and Hold or Motion -> the first columns of the CSV file
     headings: dict[str, str]  #: of those that page and terminal show too
-    columns: tuple[Column, ...]
+    columns: tuple[Quantity, ...]
 
     def texts(self, number: int, one: Any) -> list[str]:
         """Return the first cells of a row, as page and terminal show them."""
@@ -80,14 +81,14 @@ KINDS = (
         lambda n, hold: {"hold": n, "start_s": hold.start, "duration_s": hold.duration, "after": hold.after},
         {"hold": "Hold", "start_s": "At\ns", "duration_s": "For\ns"},
         (
-            Column("pose", "pose_deg", "Pose\ndeg", 1),
-            Column("drift_rate", "drift_deg_per_min", "Drift\ndeg/min", 2, below=True),
-            Column("drift_rate_uncertainty", "drift_uncertainty_deg_per_min", "±\ndeg/min", 2, largest=True),
-            Column("drift", "drift_deg", "Total drift\ndeg", 2, spare=5),
-            Column("stray", "stray_in_10_s_deg", "Within 10 s\ndeg", 2, largest=True, spare=1),
-            Column("velocity_rms", "rms_velocity_deg_per_s", "RMS velocity\ndeg/s", 2, largest=True, spare=4),
-            Column("torque_rms", "rms_torque_nm", "RMS torque\nNm", 2, spare=2),
-            Column("torque_error", "torque_error_nm", "Torque error\nNm", 3, largest=True, spare=3),
+            Quantity("pose", "pose_deg", "Pose\ndeg", 1),
+            Quantity("drift_rate", "drift_deg_per_min", "Drift\ndeg/min", 2, below=True),
+            Quantity("drift_rate_uncertainty", "drift_uncertainty_deg_per_min", "±\ndeg/min", 2, largest=True),
+            Quantity("drift", "drift_deg", "Total drift\ndeg", 2, spare=5),
+            Quantity("stray", "stray_in_10_s_deg", "Within 10 s\ndeg", 2, largest=True, spare=1),
+            Quantity("velocity_rms", "rms_velocity_deg_per_s", "RMS velocity\ndeg/s", 2, largest=True, spare=4),
+            Quantity("torque_rms", "rms_torque_nm", "RMS torque\nNm", 2, spare=2),
+            Quantity("torque_error", "torque_error_nm", "Torque error\nNm", 3, largest=True, spare=3),
         ),
     ),
     Kind(
@@ -96,9 +97,9 @@ KINDS = (
         lambda n, one: {"motion": n, "kind": one.kind, "start_s": one.start, "until_still_s": one.until_still},
         {"kind": "Motion", "start_s": "At\ns", "until_still_s": "Still after\ns"},
         (
-            Column("peak", "peak_deg", "Peak\ndeg", 1),
-            Column("residual", "residual_deg", "Residual\ndeg", 1),
-            Column("speed", "peak_speed_deg_per_s", "Peak speed\ndeg/s", 0, spare=1),
+            Quantity("peak", "peak_deg", "Peak\ndeg", 1),
+            Quantity("residual", "residual_deg", "Residual\ndeg", 1),
+            Quantity("speed", "peak_speed_deg_per_s", "Peak speed\ndeg/s", 0, spare=1),
         ),
     ),
 )
@@ -201,15 +202,23 @@ def print_tables(console: Console, recording: Recording, analysis: TrialAnalysis
             used = sum(2 + max(map(len, (*head.split("\n"), *texts))) for head, texts in cells.items())
             if used > console.width and column.spare:
                 del cells[column.heading]
-        table = Table(box=box.SIMPLE_HEAD, padding=(0, 1, 0, 0), pad_edge=False)
-        for head in cells:
-            table.add_column(head, justify="right", no_wrap=True)
-        for row in zip(*cells.values(), strict=True):
-            table.add_row(*row)
-        console.print(table)
+        print_table(console, cells, zip(*cells.values(), strict=True), justify="right", no_wrap=True)
 
 
-def _cells(rows: Sequence[Hold | Motion], column: Column) -> list[str]:
+def print_table(
+    console: Console, heads: Iterable[str], rows: Iterable[Sequence[str]], title: str | None = None, **column: Any
+) -> None:
+    """Print a table of texts. column: how each column is set, as rich has it."""
+    columns = (Column(escape(head), **column) for head in heads)
+    table = Table(
+        *columns, box=box.SIMPLE_HEAD, padding=(0, 1, 0, 0), pad_edge=False, title=title, title_justify="left"
+    )
+    for row in rows:
+        table.add_row(*map(escape, row))
+    console.print(table)
+
+
+def _cells(rows: Sequence[Hold | Motion], column: Quantity) -> list[str]:
     """Return one cell per row: its largest number, or those of all joints, aligned with those of the other rows."""
     if column.largest:
         known = ([value for value in column.of(row) if math.isfinite(value)] for row in rows)

@@ -15,6 +15,7 @@ SI units throughout: rad, rad/s, Nm, s. Arrays (joints,) are in the order of the
 import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 from itertools import pairwise
 from typing import NamedTuple
 
@@ -95,6 +96,14 @@ class Recording:
         for first, last in ((start, end),) if self.carried is None else self.carried:
             if max(start, first) < min(end, last):
                 yield max(start, first), min(end, last)
+
+    @cached_property
+    def is_carried(self) -> np.ndarray:
+        """Whether the motors carried the arm at each time, (n,)."""
+        carried = np.zeros(len(self.time), bool)
+        for start, end in self.while_carried(-math.inf, math.inf):
+            carried |= (start <= self.time) & (self.time <= end)
+        return carried
 
 
 class Blocks(NamedTuple):

@@ -137,8 +137,7 @@ class Recorder(Node):
         """Ask new nodes for their parameters, and print the live line."""
         self._guarded("parameters", self._nodes.update)
         if self._live:
-            counts = {"messages": self._writer.count, "lost": self._missed + self._writer.lost}
-            self._guarded("live state", self._live.write, counts)
+            self._guarded("live state", self._live.write)
 
     def _guarded(self, name: str, function: Callable[..., object], *args: Any) -> None:
         """Call the function; an exception is logged, once for each `name`."""
@@ -205,9 +204,9 @@ class Recorder(Node):
 class LiveLine:
     """Keeps the latest state, and writes it as one line of JSON for `trial`.
 
-    {"right": {"position": [4 rad], "velocity": [...], "effort": [...], "command": [...], "names": [...],
-    "step": {...}}, "status": {"right/can_bridge": {"level": 2, "message": "...", "state": "fault", ...}},
-    "faults": ["right/can_bridge: ..."], "recorder": {"messages": 1000, "lost": 0}}
+    {"right": {"names": [4], "position": [4 rad], "effort": [4 Nm], "step": {...}},
+    "status": {"right/can_bridge": {"level": 2, "message": "...", "state": "fault", ...}},
+    "faults": ["right/can_bridge: ..."]}
 
     status: the newest of each node on /diagnostics that still reports, its values included. faults: those whose
     level is not OK.
@@ -219,13 +218,13 @@ class LiveLine:
 
     def note(self, topic: str, data: bytes) -> None:
         """Keep the newest message of a topic, and the newest status of each node."""
-        if leaf(topic) in (STATES, content.COMMANDS, content.STEPS):
+        if leaf(topic) in (STATES, content.STEPS):
             self._latest[topic] = data
         elif topic == content.DIAGNOSTICS:
             for status in deserialize_message(data, DiagnosticArray).status:
                 self._status[status.name] = time.monotonic(), status_values(status)
 
-    def write(self, recorder: dict[str, int]) -> None:
+    def write(self) -> None:
         """Write the line to standard output."""
         line: dict[str, Any] = {}
         for topic, data in self._latest.items():
@@ -234,15 +233,12 @@ class LiveLine:
             if name == content.STEPS:
                 with contextlib.suppress(ValueError):  # the report states it
                     arm["step"] = json.loads(message.data)
-            elif name == content.COMMANDS:
-                arm["command"] = list(message.effort)
             else:
-                arm["names"] = list(message.name)
-                arm |= {field: list(getattr(message, field)) for field in ("position", "velocity", "effort")}
+                arm |= {"names": [*message.name], "position": [*message.position], "effort": [*message.effort]}
         oldest = time.monotonic() - TIMING.live_silence
         status = {name: values for name, (arrived, values) in self._status.items() if arrived > oldest}
         faults = [f"{name}: {values['message']}" for name, values in status.items() if values["level"]]
-        line |= {"recorder": recorder, "status": status, "faults": faults}
+        line |= {"status": status, "faults": faults}
         sys.stdout.write(json.dumps(line) + "\n")
         sys.stdout.flush()
 

@@ -133,7 +133,7 @@ export class Picture {
       (state.joints ?? []).forEach((joint, n) => {
         const part = this.arms.joints[joint.name];
         if (!part) return;
-        this.rotate(part, joint.position);
+        if (joint.position !== null) this.rotate(part, joint.position);
         if (target) this.rotate(this.ghost.joints[joint.name], target[n]);
         const share = (joint.effort ?? 0) / (setups[arm]?.max_effort?.[n] || 1);
         part.bar.scale.y = Math.max(0.001, 0.25 * Math.abs(share));

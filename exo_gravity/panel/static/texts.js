@@ -57,7 +57,7 @@ export function finite(text) {
   return Number.isFinite(value) ? value : null;
 }
 
-export const degrees = (radians) => (radians * 180) / Math.PI;
+export const degrees = (radians) => (radians === null ? null : (radians * 180) / Math.PI);
 
 // Writes a text only where it differs: screen readers announce each change.
 export function write(element, text) {
