@@ -45,7 +45,10 @@ def in_processes(
     def worked_on(item: Item) -> Outcome[Item, Result]:
         process = idle.get()
         outcome = _outcome(item, lambda: process.submit(work, item).result(), BrokenProcessPool)
-        idle.put(process if outcome.problem != ENDED else ProcessPoolExecutor(1, SPAWNED))
+        if outcome.problem == ENDED:
+            process.shutdown()  # before it is forgotten: else its thread may wait for itself for ever
+            process = ProcessPoolExecutor(1, SPAWNED)
+        idle.put(process)
         return outcome
 
     count = min(workers or os.cpu_count() or 1, len(items) or 1)

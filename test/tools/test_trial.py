@@ -16,6 +16,7 @@ import sys
 import threading
 from concurrent.futures import Future
 from dataclasses import replace
+from functools import partial
 from subprocess import PIPE
 
 import imageio.v3 as iio
@@ -147,15 +148,17 @@ def test_the_packaged_arm_drifts_less_than_a_fifth_of_a_degree_per_minute_in_all
 @pytest.mark.usefixtures("without_pictures")
 def test_ctrl_c_lets_the_arm_down_and_reports_what_was_recorded(run, monkeypatch):
     def stop_on_signals() -> threading.Event:
-        stopped = processes.stop_on_signals()
-        threading.Timer(0.5, os.kill, (os.getpid(), signal.SIGINT)).start()
+        stopped, asked = processes.stop_on_signals(), itertools.count()  # once a simulated second
+        is_set, press = stopped.is_set, partial(os.kill, os.getpid(), signal.SIGINT)
+        stopped.is_set = lambda: (next(asked) == 5 and press()) or is_set()
         return stopped
 
     monkeypatch.setattr(trial, "stop_on_signals", stop_on_signals)
-    ended, folder = run("--offline", script={"name": "long", "steps": [SHORT["steps"][0], {"hold": 3000.0}]})
+    long = {"name": "long", "steps": [SHORT["steps"][0], {"hold": 3000.0}]}
+    ended, folder = run("--offline", script=long, base="sim_both.yaml")  # the second arm is not even begun
     assert ended.code == 1 and (folder / "report.html").exists()
     assert "stopped by the operator" in ended.out and "slipped" not in ended.out
-    assert "right/can_bridge: stopped by the operator" in (folder / "report.html").read_text(encoding="utf-8")
+    assert "left/can_bridge: stopped by the operator" in (folder / "report.html").read_text(encoding="utf-8")
 
 
 BOW, HOLD = {"bow": math.radians(30.0), "over": 3.0}, {"hold": 1.0}

@@ -164,9 +164,9 @@ class OfflineTrial:
         self.events.append(Event(now, f"{status.node}: {message}", status=status))
 
     def _recording(self) -> Recording:
-        if not self._rows:
-            raise DataError(self.trouble or f"{self.arm.name}: nothing was recorded")
         table = np.array(self._rows).reshape(-1, 1 + len(ARRAYS) * len(self._no_effort))
+        if len(table) < 2:
+            raise DataError(self.trouble or f"{self.arm.name}: nothing was recorded")
         position, velocity, effort, command = np.split(table[:, 1:], len(ARRAYS), axis=1)
         steps = self.script.steps
         starts = itertools.accumulate((step.duration for step in steps), initial=self._start)

@@ -577,11 +577,6 @@ def test_numbers_and_texts_are_those_that_rosbags_decodes_and_a_damaged_message_
 # Events and parameters
 
 
-def read_of(folder, *more, until=np.inf):
-    kept = [item for item in (*MESSAGES, *more) if item[2] < made.START + until * 1e9]
-    return read_bag(made.write_bag(folder / "bag", kept))
-
-
 def states(*names, first=0.1, period=0.5):
     """The bridge's state, every half second from 0.1 s on; None for no report."""
     return [made.status(first + number * period, name, state=name) for number, name in enumerate(names) if name]
@@ -589,7 +584,7 @@ def states(*names, first=0.1, period=0.5):
 
 def test_an_arm_is_carried_from_the_first_to_the_last_carrying_state(tmp_path):
     names = ["checking", "ramping in", "active", "active", "letting down", "fault", "checking", "active", "active"]
-    (arm,) = read_of(tmp_path, *states(*names, first=0.0, period=0.1)).recordings
+    (arm,) = read(tmp_path, [*MESSAGES, *states(*names, first=0.0, period=0.1)]).recordings
     arrival = 0.0002  # s, of the first joint state, at which time begins
     np.testing.assert_allclose(arm.carried, [(0.1 - arrival, 0.3 - arrival), (0.7 - arrival, 0.8 - arrival)], atol=1e-9)
 
@@ -604,7 +599,8 @@ def test_an_arm_is_carried_from_the_first_to_the_last_carrying_state(tmp_path):
     ],
 )
 def test_a_recording_that_ends_before_the_arm_is_down_says_so(tmp_path, names, notes):
-    found = read_of(tmp_path, *states(*names), until=4.35)
+    until = made.START + 4.35 * SECOND
+    found = read(tmp_path, [item for item in (*MESSAGES, *states(*names)) if item[2] < until])
     assert len(found.notes) == notes and all(note.startswith("right: the recording ends") for note in found.notes)
     if len(names) == 20:
         (arm,) = found.recordings
@@ -625,9 +621,9 @@ def test_faults_changed_parameters_and_parameters_at_the_start_are_read(tmp_path
     snapshot = "/right/compensator:\n  ros__parameters: {law: exact}\n"
     keys = {"fault": "motor_silent", "fault text": "elbow: no reply for 0.05 s"}
     silent = [made.status(seconds, "motor 2 is silent", level=2, **keys) for seconds in (3.0, 3.5)]
-    found = read_of(
-        tmp_path, made.text_entry("/recorder/parameters", 1.0, snapshot), made.status(2.0, "fine"), *silent,
-        made.status(4.0, "fine"), parameter_event(5.0, "support", 0.5),
+    found = read(
+        tmp_path, [*MESSAGES, made.text_entry("/recorder/parameters", 1.0, snapshot), made.status(2.0, "fine"), *silent,
+        made.status(4.0, "fine"), parameter_event(5.0, "support", 0.5)],
     )  # fmt: skip
     assert [(round(event.time, 3), event.text) for event in found.events] == [
         (3.0, "right/can_bridge: motor 2 is silent"),
