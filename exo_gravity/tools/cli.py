@@ -13,8 +13,8 @@ from collections.abc import Callable, Sequence
 from functools import partial
 from io import TextIOWrapper
 
-from exo_gravity.core.errors import ExoGravityError
-from exo_gravity.lab.packages import extras
+from exo_gravity.core.errors import ExoGravityError, ParameterError
+from exo_gravity.lab.packages import MissingPackageError, extras
 
 
 def _number(text: str, kind: type[float], least: int, expected: str) -> float:
@@ -32,8 +32,10 @@ non_negative = partial(_number, kind=float, least=0, expected="a number, 0 or mo
 positive = partial(_number, kind=int, least=1, expected="a whole number, 1 or more")
 
 
-def exit_code(tool: str, extra: str, work: Callable[[], int]) -> int:
-    """Return the exit code of `work`; where that raises an error, print it as one line and return 2.
+def exit_code(tool: str, extra: str, work: Callable[[], int], failed: int = 2) -> int:
+    """Return the exit code of `work`; where that raises an error, print it as one line.
+
+    The code is then 2 for wrong use or a missing package, and `failed` for what else went wrong.
 
     After Ctrl-C it is 130, and 141 where the reader of the output has ended, like `head`: the shell's codes for both.
     """
@@ -54,7 +56,7 @@ def exit_code(tool: str, extra: str, work: Callable[[], int]) -> int:
         what = f"{error.filename}: {error.strerror}" if isinstance(error, OSError) and error.filename else error
         print(f"{tool}: {what}", file=sys.stderr)
         _give_up_output()
-        return 2
+        return 2 if isinstance(error, ParameterError | MissingPackageError) else failed
 
 
 def command(
@@ -62,12 +64,13 @@ def command(
     extra: str,
     arguments: Callable[[Sequence[str] | None], argparse.Namespace],
     run: Callable[[argparse.Namespace], int],
+    failed: int = 2,
 ) -> Callable[[Sequence[str] | None], int]:
     """Return the entry point of a tool: it runs the command line, and returns the exit code."""
 
     def main(args: Sequence[str] | None = None) -> int:
         options = arguments(args)
-        return exit_code(name, extra, lambda: run(options))
+        return exit_code(name, extra, lambda: run(options), failed)
 
     return main
 

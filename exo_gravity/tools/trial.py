@@ -19,29 +19,31 @@ import sys
 from collections.abc import Callable, Sequence
 from datetime import datetime
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 from exo_gravity import version
-from exo_gravity.core.errors import DataError, ExoGravityError, ParameterError
+from exo_gravity.core.errors import DataError
 from exo_gravity.core.params import params_of
 from exo_gravity.lab.bag.content import Session
 from exo_gravity.lab.inputs.parameter_file import packaged_config
-from exo_gravity.lab.packages import MissingPackageError
 from exo_gravity.lab.processes import stop_on_signals
 from exo_gravity.lab.report import video
 from exo_gravity.lab.trial.scripted import analysed, packaged_trials, read_script
-from exo_gravity.tools.cli import extras
+from exo_gravity.tools.cli import command, extras
 
-if TYPE_CHECKING:
+
+def _run(options: argparse.Namespace) -> int:
+    """Run and report a trial; return the exit code. Raises ExoGravityError."""
+    params, clip = (
+        Path(options.params or packaged_config("sim.yaml")),
+        video.requested(options.video, options.video_speed),
+    )
     from rich.console import Console
 
-
-def _run(options: argparse.Namespace, params: Path, clip: video.Clip | None, console: "Console") -> int:
-    """Run and report a trial; return the exit code. Raises ExoGravityError."""
     from exo_gravity.lab.bag.reader import read_bag
     from exo_gravity.lab.report import trial_report
     from exo_gravity.lab.trial.run import STOPPED, Trial, check_bridges, run_trial
 
+    console = Console(highlight=False, stderr=bool(options.attach))
     path, script = read_script(options.name)
     session, now = Session(options.subject, options.protocol, options.note, version()), datetime.now()
     folder = Path(options.output).resolve() / session.folder(now) / f"{script.name}_{now:%Y%m%d_%H%M%S}"
@@ -103,16 +105,4 @@ def _arguments(args: Sequence[str] | None) -> argparse.Namespace:
     return parser.parse_args(args)
 
 
-def main(args: Sequence[str] | None = None) -> int:
-    """Run the command line; return the exit code."""
-    try:
-        options = _arguments(args)
-        params = Path(options.params or packaged_config("sim.yaml"))
-        clip = video.requested(options.video, options.video_speed)
-        with extras("trial", "report"):
-            from rich.console import Console
-
-            return _run(options, params, clip, Console(highlight=False, stderr=bool(options.attach)))
-    except ExoGravityError as error:
-        print(f"trial: {error}", file=sys.stderr)
-        return 2 if isinstance(error, ParameterError | MissingPackageError) else 1
+main = command("trial", "report", _arguments, _run, failed=1)

@@ -119,24 +119,31 @@ class PlayedArms:
         position = [middle + 0.3 * math.sin(0.5 * now + n) for n, middle in enumerate(self.pose)]
         effort = [0.8 * math.sin(0.5 * now + n) for n in range(len(names))]
         state, fault = self.states[name], self.faults.get(name, "none")
-        values = {"state": state, "fault": fault, "rate (Hz)": "250.0", "age of efforts (ms)": "4.1"}
-        values |= {
+        bridge = {
+            "level": 2 if fault != "none" else 0,
+            "message": f"fault: {fault}: {name} elbow" if fault != "none" else state,
+            "state": state,
+            "fault": fault,
+            "rate (Hz)": "250.0",
+            "age of efforts (ms)": "4.1",
             "limits acting": "none",
             "damped by": "still joint (elbow)",
             **{f"{joint} temperature (degC)": "31" for joint in names},
-        }
-        values["pose to confirm (deg)"] = self.asked.get(name, "none")
-        values["resume"] = "possible" if fault == "command_stale" else "has_cause"
-        values |= {
+            "pose to confirm (deg)": self.asked.get(name, "none"),
+            "resume": "possible" if fault == "command_stale" else "has_cause",
             "source": "simulated",
             "motors": "on" if state in ("proving signs", "ramping in", "active", "letting down") else "off",
             "refusal": "none",
+            "waiting for": "none",
+            "joints outside limits": "none",
+            "turn back (deg)": "none",
+            **self.reports.get(name, {}),
         }
-        values |= {"waiting for": "none", "joints outside limits": "none", "turn back (deg)": "none"}
-        sentence = f"fault: {fault}: {name} elbow" if fault != "none" else state
-        bridge = {**values, "level": 2 if fault != "none" else 0, "message": sentence, **self.reports.get(name, {})}
-        carried = {"mass carried (kg)": "1.854", "level": 0, "message": "compensating", "state": "compensating"}
-        carried |= {
+        carried = {
+            "mass carried (kg)": "1.854",
+            "level": 0,
+            "message": "compensating",
+            "state": "compensating",
             "changing load": "none",
             "reason": "none",
             "weighing": "none",
