@@ -223,7 +223,7 @@ def record_offline(trial: Trial, console: Console, should_stop: Callable[[], boo
     assert trial.params is not None, "arms that are carried already are not simulated here"
     simulated = simulated_trials(trial.params, trial.script)
     nodes = load(trial.prepare(with_recorder=False))
-    recordings = []
+    recordings = list[Recording]()
     with Progress(console=console, transient=True, disable=not console.is_terminal) as progress:
         for one in simulated:
             if recordings and should_stop():
