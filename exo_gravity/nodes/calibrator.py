@@ -16,7 +16,6 @@ import time
 from typing import Any
 
 from diagnostic_msgs.msg import DiagnosticArray
-from rclpy.node import Node
 from sensor_msgs.msg import JointState
 
 from exo_gravity.core.errors import ParameterError
@@ -36,6 +35,7 @@ from exo_gravity.nodes.ros.subscriptions import (
     PeriodicThread,
     PolledSubscription,
     Publishers,
+    ThreadedNode,
     TiltSubscription,
     second_publisher,
 )
@@ -44,7 +44,7 @@ REPORT_PERIOD = 0.1  # s
 PLAN_PERIOD = 0.05  # s
 
 
-class CalibratorNode(Node):
+class CalibratorNode(ThreadedNode):
     """The ROS shell around `lab.calibration.tour.Tour`."""
 
     def __init__(self) -> None:
@@ -71,19 +71,13 @@ class CalibratorNode(Node):
         self.create_subscription(DiagnosticArray, "/diagnostics", self._on_diagnostics, 10)
         self.create_timer(REPORT_PERIOD, self._report)
         # Poses are chosen on a thread of their own: neither joint states nor tilts may wait for it.
-        self._planner = PeriodicThread("plan", self._tour.plan, PLAN_PERIOD)
-        self._joint_states.start()
-        self._planner.start()
-
-    @property
-    def failure(self) -> Exception | None:
-        """The exception that ended the thread of the joint states, or that of the poses."""
-        return self._joint_states.failure or self._planner.failure
+        self.threads += [self._joint_states, PeriodicThread("plan", self._tour.plan, PLAN_PERIOD)]
+        for thread in self.threads:
+            thread.start()
 
     def close(self) -> None:
         """Stop answering joint states, and report what is still unreported."""
-        self._joint_states.stop()
-        self._planner.stop()
+        super().close()
         self._report()
 
     def _on_joint_states(self, message: JointState, info: dict[str, Any]) -> None:

@@ -39,6 +39,7 @@ from exo_gravity.nodes.ros.subscriptions import (
     PeriodicThread,
     PolledSubscription,
     Publishers,
+    ThreadedNode,
 )
 
 # The fusion integrates every sample. A queue of depth 1 would lose samples whenever the node is delayed.
@@ -52,7 +53,7 @@ SAME_CLOCK = 5.0  # s between stamp and arrival
 UNKNOWN_HEADING = math.pi**2  # rad^2, its variance
 
 
-class ImuNode(Node):
+class ImuNode(ThreadedNode):
     """The ROS shell around `hardware.trunk_estimator.TrunkEstimator`."""
 
     def __init__(self) -> None:
@@ -74,20 +75,12 @@ class ImuNode(Node):
         self._pitch_yaw = self.create_publisher(Vector3Stamped, PITCH_YAW, DEPTH)
         self._data = self.create_publisher(Imu, DATA, DEPTH)
         self._device = None if values["source"] == "topic" else ImuDevice(self, values, self._topic, self._on_imu)
-        self._samples = self._device or PolledSubscription(
+        samples = self._device or PolledSubscription(
             self, Imu, self._topic, self._on_imu, QoSProfile(depth=DEPTH, reliability=ReliabilityPolicy.BEST_EFFORT)
         )
         self.create_timer(WATCH_PERIOD, self._report)
-        self._samples.start()
-
-    @property
-    def failure(self) -> Exception | None:
-        """The exception that ended the thread of the samples."""
-        return self._samples.failure
-
-    def close(self) -> None:
-        """Stop taking samples."""
-        self._samples.stop()
+        self.threads.append(samples)
+        samples.start()
 
     def _on_imu(self, message: Imu, info: dict[str, Any]) -> None:
         self._arrived = time.monotonic()

@@ -12,7 +12,6 @@ from functools import partial
 from typing import Any
 
 import numpy as np
-from rclpy.node import Node
 from rclpy.qos import qos_profile_sensor_data
 from sensor_msgs.msg import Imu
 from std_msgs.msg import String
@@ -27,7 +26,7 @@ from exo_gravity.nodes.ros.imu_messages import message_of
 from exo_gravity.nodes.ros.messages import OK, WARN, Diagnostics
 from exo_gravity.nodes.ros.parameters import accept_changes, bus_of, declare, given_to
 from exo_gravity.nodes.ros.run import run
-from exo_gravity.nodes.ros.subscriptions import LATCHED, PeriodicThread
+from exo_gravity.nodes.ros.subscriptions import LATCHED, PeriodicThread, ThreadedNode
 
 with extras("simulator", "sim"):
     from exo_gravity.sim import SimulatedImu, VirtualWearer
@@ -39,7 +38,7 @@ with extras("simulator", "sim"):
 TRUNK_SPEED = 0.5  # rad/s at which the trunk turns to a new tilt
 
 
-class Simulator(Node):
+class Simulator(ThreadedNode):
     """The ROS shell around `sim.SimulatedDevice`, which runs on a thread of its own.
 
     That thread also publishes, while no motor has a reply to send. Another thread that publishes would hold the
@@ -76,13 +75,8 @@ class Simulator(Node):
         names = " and ".join(str(bus.channel_info) for bus in buses.values())
         self.get_logger().info(f"simulated {values['side']} arm on {names}")
         play = partial(self._device.run, self._buses, self._stopping.is_set, self._on_idle)
-        self._thread = PeriodicThread("device", play, 0.0)
-        self._thread.start()
-
-    @property
-    def failure(self) -> Exception | None:
-        """The exception that ended the thread, or None; `run` then ends the node."""
-        return self._thread.failure
+        self.threads.append(PeriodicThread("device", play, 0.0))
+        self.threads[0].start()
 
     @property
     def needed(self) -> bool:
@@ -92,7 +86,7 @@ class Simulator(Node):
     def close(self) -> None:
         """Stop the device and close its buses."""
         self._stopping.set()
-        self._thread.stop()
+        super().close()
         for bus in set(self._buses):
             bus.shutdown()
 

@@ -43,7 +43,13 @@ from exo_gravity.nodes.others import NodeParameters, Statuses
 from exo_gravity.nodes.ros.messages import OK, STALE, WARN, Diagnostics, by_name
 from exo_gravity.nodes.ros.parameters import declare
 from exo_gravity.nodes.ros.run import run
-from exo_gravity.nodes.ros.subscriptions import LATCHED, PeriodicThread, PolledSubscription, TiltSubscription
+from exo_gravity.nodes.ros.subscriptions import (
+    LATCHED,
+    PeriodicThread,
+    PolledSubscription,
+    ThreadedNode,
+    TiltSubscription,
+)
 
 COMPENSATOR = "compensator"
 PARAMETER_PERIOD = 0.1  # s between two looks whether the compensator's parameters are to be read
@@ -124,7 +130,7 @@ class Trunk:
         self._felt_at, self._force, self._rate = now, force, rate
 
 
-class WearerNode(Node):
+class WearerNode(ThreadedNode):
     """The ROS shell around a `WearerWatch`.
 
     The estimate has a thread of its own: rclpy's executor would take more of the processor than the arithmetic does.
@@ -167,17 +173,8 @@ class WearerNode(Node):
         self._last = -math.inf  # monotonic s of the newest sample
         self.create_timer(PARAMETER_PERIOD, self._follow_compensator)
         self.create_timer(REPORT_PERIOD, self._report)
-        self._thread = PeriodicThread("estimate", self._tick, 0.0)
-        self._thread.start()
-
-    @property
-    def failure(self) -> Exception | None:
-        """The exception that ended the thread of the estimate."""
-        return self._thread.failure
-
-    def close(self) -> None:
-        """End the thread."""
-        self._thread.stop()
+        self.threads.append(PeriodicThread("estimate", self._tick, 0.0))
+        self.threads[0].start()
 
     def _follow_compensator(self) -> None:
         """Read the compensator's parameters if they may have changed."""

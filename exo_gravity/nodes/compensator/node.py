@@ -15,7 +15,6 @@ from functools import partial
 from typing import Any
 
 from rclpy.context import Context
-from rclpy.node import Node
 from rclpy.parameter import Parameter
 from sensor_msgs.msg import JointState
 from std_srvs.srv import Trigger
@@ -45,9 +44,9 @@ from exo_gravity.nodes.ros.run import run
 from exo_gravity.nodes.ros.subscriptions import (
     NEWEST_ONLY,
     SHORT_QUEUE,
-    PeriodicThread,
     PolledSubscription,
     Publishers,
+    ThreadedNode,
     TiltSubscription,
     second_publisher,
 )
@@ -59,7 +58,7 @@ ASSIST_PAUSE, REQUEST_PAUSE = 0.002, 0.1
 MAX_CHANGES = 16  # answers whose reason is new, waiting for the report
 
 
-class CompensatorNode(Node):
+class CompensatorNode(ThreadedNode):
     """The ROS shell around a compensator.
 
     context: of a compensator in can_bridge's process, which calls `answer`. Otherwise joint states come by their topic.
@@ -74,7 +73,6 @@ class CompensatorNode(Node):
         self._names = values["joint_names"]
         settings = read(values)
         self._control = Compensator(settings, self._names)
-        self._threads: list[PeriodicThread] = []
         self._serve_wearer(self._control.terms)
         is_called = context is not None  # by can_bridge: then the topic is polled in `answer`
         self._interface = self._open_interface(values, is_called)
@@ -91,7 +89,7 @@ class CompensatorNode(Node):
         self._joint_states = PolledSubscription(
             self, JointState, topic, self._on_joint_states, SHORT_QUEUE if is_called else NEWEST_ONLY, raw=is_called
         )
-        self._threads.append(self._joint_states)
+        self.threads.append(self._joint_states)
         self._poll_tilt: Callable[[], None] = lambda: None
         if values["use_imu"]:
             tilt = TiltSubscription(
@@ -104,7 +102,7 @@ class CompensatorNode(Node):
         self._changed = self.create_guard_condition(self._report_changes)
         self.create_timer(REPORT_PERIOD, self._report_current)
         self.get_logger().info(sentence(settings, self._side))
-        for thread in self._threads:
+        for thread in self.threads:
             if not is_called or thread is not self._joint_states:
                 thread.start()
         set_realtime_priority(values["thread_priority"], self.get_logger().warning)
@@ -113,7 +111,7 @@ class CompensatorNode(Node):
         """Add assistance, support on request, and the services of clients, such as `weigh`."""
         self._assist = terms.assist
         self._assistant, self._requester = Publishers(), Publishers()
-        self._threads += [
+        self.threads += [
             PolledSubscription(self, JointState, "assist_efforts", self._on_assist_efforts, pause=ASSIST_PAUSE),
             PolledSubscription(
                 self, JointState, SUPPORT_REQUEST, self._on_support_request, SHORT_QUEUE, pause=REQUEST_PAUSE
@@ -131,18 +129,8 @@ class CompensatorNode(Node):
         if is_called:
             raise ParameterError("command_interface", "multi_array", "joint_state in one process with can_bridge")
         interface = MultiArrayInterface(self, self._names, values)
-        self._threads.append(interface)
+        self.threads.append(interface)
         return interface
-
-    @property
-    def failure(self) -> Exception | None:
-        """The exception that ended the thread of the joint states, of another topic, or of a fade."""
-        return next((each.failure for each in self._threads if each.failure), None)
-
-    def close(self) -> None:
-        """End the threads."""
-        for thread in reversed(self._threads):
-            thread.stop()
 
     def answer(self, message: JointState) -> JointState | None:
         """Return the efforts for a joint state of can_bridge, on its control thread; None once this has failed.

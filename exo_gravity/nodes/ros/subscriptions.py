@@ -74,6 +74,24 @@ class PeriodicThread:
             self.failure = error
 
 
+class ThreadedNode(Node):
+    """A node with `threads` beside its executor, which `run` ends."""
+
+    def __init__(self, *args: Any, **options: Any) -> None:
+        super().__init__(*args, **options)
+        self.threads: list[PeriodicThread] = []
+
+    @property
+    def failure(self) -> Exception | None:
+        """The exception that ended one of the threads, or None."""
+        return next((thread.failure for thread in self.threads if thread.failure), None)
+
+    def close(self) -> None:
+        """End the threads, the last one first."""
+        for thread in reversed(self.threads):
+            thread.stop()
+
+
 class PolledSubscription(PeriodicThread):
     """Calls `callback(message, info)` for each message of `topic`: on a thread after `start`, or in each `poll`.
 
