@@ -179,7 +179,13 @@ class Compensator:
             rate_limited(new, last, step * (s.max_effort_rate + turn * most))
             for new, last, most in zip(torque, self._effort, s.max_effort, strict=True)
         ])  # fmt: skip
-        if s.mode == "zero_g" and velocity and self.applied and now - self._touch_watch.time >= TOUCH.period:
+        if (
+            s.mode == "zero_g"
+            and velocity
+            and now - self._touch_watch.time >= TOUCH.period
+            and self.applied
+            and max(map(abs, self.applied)) > TOUCH.least  # motors that are off carry no arm
+        ):
             self._withdraw_from_empty(at, velocity, self.applied)
         over = tuple([n for n, most in enumerate(s.max_effort) if not -most <= gravity[n] <= most])
         remainder = () if change.is_over else change.remainder
