@@ -18,7 +18,7 @@ import rtbdata
 
 from exo_gravity.core import STANDARD_GRAVITY, gravity_torque
 from exo_gravity.core.arm.interface import NO_LOAD, Payload
-from exo_gravity.core.arm.tilt import SIDES, Tilt
+from exo_gravity.core.arm.tilt import AXES, SIDES, Tilt
 from exo_gravity.core.compensation.settings import Settings, compensator_table, settings_of
 from exo_gravity.core.errors import ParameterError
 from exo_gravity.core.params import values_of
@@ -126,6 +126,7 @@ def test_the_exoskeletons_own_description_gives_the_torques_of_the_exact_law_bar
             theta, gravity = random.uniform(-3.0, 3.0, 4), random_gravity(random)
             expected = gravity_torque(exact, theta, Tilt.of_gravity(side, gravity).direction)
             assert np.allclose(torque_of(described, theta, gravity), expected, rtol=0.0, atol=1e-9)
+        assert np.allclose(*(np.abs([each.torque(theta, axis) for axis in AXES]) for each in (described, exact)))
         assert described.total_mass == pytest.approx(exact.total_mass)
     sides = [name.replace(side, other) for other in ("left", "right") for name in own.joint_names]
     assert UrdfArm(urdf_of(params), sides).total_mass == pytest.approx(2.0 * own.robot.total_mass)  # two chains

@@ -110,5 +110,5 @@ def rotation_matrix(quaternion: Vector | None, name: str = "quaternion") -> np.n
     return np.column_stack([rotated(unit, axis) for axis in ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))])
 
 
-#: gravity along each axis of the base frame, for the exact law
-AXES = tuple(Tilt.of("left")._replace(direction=axis) for axis in ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0)))
+#: gravity along each axis of the base frame, for the exact law: in the trunk's axes to the left, forward, down
+AXES = tuple(Tilt.of_gravity("left", axis) for axis in ((0.0, 1.0, 0.0), (1.0, 0.0, 0.0), (0.0, 0.0, -1.0)))
