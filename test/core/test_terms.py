@@ -8,6 +8,7 @@ faded within 100 ms when it is not.
 
 import math
 import random
+import timeit
 from collections import deque
 from collections.abc import Callable
 from typing import Any, NamedTuple
@@ -154,8 +155,8 @@ def test_friction_is_zero_at_standstill_and_does_not_step():
     friction = Friction(0.8, (0.2,) * 4)
     speeds = np.linspace(-2.0 * FRICTION.sliding, 2.0 * FRICTION.sliding, 400)
     torque = np.array([friction.torque(STATE._replace(velocity=(v, 0.0, 0.0, 0.0)))[0] for v in speeds])
-    one_code = 2.0 * 45.0 / 4095.0
-    assert one_code < FRICTION.standstill  # standstill reads as half a code, and may flicker to the next
+    # Standstill reads as half a code, and may flicker to the next.
+    assert FRICTION.standstill > 2.0 * 45.0 / 4095.0
     assert not torque[np.abs(speeds) <= FRICTION.standstill].any()
     assert np.abs(np.diff(torque)).max() < 0.01
     assert torque[-1] == pytest.approx(0.16)
@@ -177,6 +178,11 @@ SPRING = Spring((2.0,) * 4, PATH, max_effort=(9.0 / 2,) * 4)
 GIVEN = {  # a term, its input, and its torque
     "the workspace is free inside": (WORKSPACE, {"position": (0.9, 0.3, 0.5, 0.99), "velocity": (1.0,) * 4}, ZERO),
     "and pushes back outside": (WORKSPACE, {"position": (1.1, 0.1, 9.0, -0.1)}, (-0.3, 0.3, -0.5, 0.3)),
+    "without an edge it is free beyond half a turn, too": (
+        SoftLimits((-1.0, -3.15, -3.15, -3.15)),
+        {"position": (0.0, 4.0, -4.0, 9.0)},
+        ZERO,
+    ),
     **{
         f"a spring on a recorded path, {elapsed} s after its start": (
             SPRING,
@@ -204,8 +210,7 @@ def test_the_tank_gives_what_it_holds_and_no_more():
     for _ in range(4000):
         given += tank.pass_on((1.0, 0.0, 0.0, 0.0), (1.0, 0.0, 0.0, 0.0), 0.002, 0.0)[0] * 0.002
     assert 0.9 * INERTIA.tank < given <= INERTIA.tank
-    taken = tank.pass_on((-1.0, 0.0, 0.0, 0.0), (1.0, 0.0, 0.0, 0.0), 0.002, 0.0)
-    assert taken[0] == -1.0  # a torque that takes energy always passes
+    assert tank.pass_on((-1.0, *[0.0] * 3), (1.0, *[0.0] * 3), 0.002, 0.0)[0] == -1.0  # what takes energy always passes
 
 
 def test_what_the_terms_before_a_change_would_give_stays_known():
@@ -249,12 +254,16 @@ def test_soft_limits_are_no_stiffer_than_is_stable():
     assert stiff == pytest.approx(np.minimum(10.0, 0.8 * most))
 
 
-def test_parameters_make_settings():
-    given = {"friction.share": 0.5, "coupling.stiffness": [0.0, -1.0, 2.0, 0.0], "spring.pose": [0.1] * 4}
+def test_parameters_make_settings_and_a_path_of_a_minute_holds_no_cycle_up():
+    given = {
+        "friction.share": 0.5,
+        "coupling.stiffness": [0.0, -1.0, 2.0, 0.0],
+        "spring.pose": np.ravel([(0.01 * row, *[0.1] * 4) for row in range(6000)]).tolist(),
+    }
     assert term_settings_of(values_of(term_parameters(), {})) == TermSettings()
     built = term_settings_of(values_of(term_parameters(), given))
-    assert (built.friction.share, built.coupling.stiffness) == (0.5, (0.0, -1.0, 2.0, 0.0))
-    assert built.spring.pose == (0.1,) * 4
+    assert (built.friction.share, [*built.coupling.stiffness], [*built.spring.pose]) == tuple(given.values())
+    assert min(timeit.repeat(lambda: built.spring.torque(STATE), number=1, repeat=9)) < 0.0005  # s
 
 
 @pytest.mark.parametrize("edge", [{"lower": (-3.15, 0.2, -3.15, -3.15)}, {"upper": (3.15, 3.15, 1.0, 3.15)}])
@@ -409,6 +418,7 @@ WRONG = {
     "infinite": ({"efforts": (math.inf, 0.0, 0.0, 0.0)}, "must be numbers within 40 Nm"),
     "huge": ({"efforts": (0.0, 0.0, 41.0, 0.0)}, "must be numbers within 40 Nm"),
     "misnamed": ({"names": [*NAMES[:3], "wrist"]}, "must name rotation, abduction, flexion, elbow"),
+    "more names than joints, of which some cannot be sorted": ({"names": [*NAMES, 5]}, "must name"),
     "a name twice": ({"names": [*NAMES[:3], "flexion"]}, "must name"),
     "a joint missing": ({"names": NAMES[:3], "efforts": (0.0,) * 3}, "must name"),
     "too few efforts": ({"efforts": (0.0,) * 3}, "must name"),

@@ -104,7 +104,7 @@ class AssistInput:
         self, now: float, names: Sequence[str], efforts: Sequence[float], stamp: float, second: bool
     ) -> Status:
         """Return what is wrong with a message, without a measured value; false if nothing is."""
-        if sorted(names) != sorted(self._names) or len(efforts) != len(names):
+        if not len(names) == len(efforts) == len(self._names) or sorted(names) != sorted(self._names):
             unnamed = f"assist_efforts must name {', '.join(self._names)}, each once, with one effort each"
             return Status(AssistProblem.INVALID, unnamed)
         if not all(-MAX_COMMAND <= tau <= MAX_COMMAND for tau in efforts):

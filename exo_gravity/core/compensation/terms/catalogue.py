@@ -134,7 +134,7 @@ class Spring(TermParameters):
         any_length=True,
     )
     max_effort: Sequence[float] = SPRING.effort  #: largest torque, (n,) Nm
-    times: tuple[float, ...] = field(init=False, repr=False, compare=False)  #: (m,) s of the path's rows, from 0 on
+    times: np.ndarray = field(init=False, repr=False, compare=False)  #: (m,) s of the path's rows, from 0 on
     ways: np.ndarray = field(init=False, repr=False, compare=False)  #: (n, m) rad, each joint's angles
 
     def __post_init__(self) -> None:
@@ -143,15 +143,15 @@ class Spring(TermParameters):
         object.__setattr__(self, "max_effort", for_joints(self.max_effort, count))
         path = (0.0, *numbers) if len(numbers) == count else numbers
         rows = np.reshape(path, (-1, 1 + count)) if len(path) % (1 + count) == 0 else np.empty((0, 1))
-        times, poses = rows[:, 0], rows[:, 1:]
-        if not (len(rows) and np.all(np.abs(poses) <= FREE)):
+        times, *_ = columns = rows.T.copy()  # in one piece, or `np.interp` would copy them in each cycle
+        if not (len(rows) and np.all(np.abs(columns[1:]) <= FREE)):
             raise ParameterError("spring.pose", list(numbers), f"{count} angles within {FREE:g} rad, or a path of rows")
         if times[0] != 0.0 or not (np.all(np.diff(times) > 0.0) and times[-1] < math.inf):
             raise ParameterError("times of the path in spring.pose", times[:3].tolist(), "rising from 0 s")
-        speed = max((np.linalg.norm(np.diff(poses, axis=0), axis=1) / np.diff(times)).tolist(), default=0.0)
+        speed = max((np.linalg.norm(np.diff(columns[1:]), axis=0) / np.diff(times)).tolist(), default=0.0)
         if speed > SPRING.path_speed:
             raise ParameterError("speed of the path in spring.pose", speed, f"at most {SPRING.path_speed:g} rad/s")
-        for name, value in (("pose", numbers), ("times", tuple(times.tolist())), ("ways", poses.T)):
+        for name, value in (("pose", numbers), ("times", times), ("ways", columns[1:])):
             object.__setattr__(self, name, value)
 
     def torque(self, state: TermState) -> Torque:
@@ -232,7 +232,7 @@ class SoftLimits(TermParameters):
         edges = self.lower, self.upper
         columns = zip(self.stiffness, *edges, state.position, state.velocity, self.max_effort, strict=True)
         for k, low, high, q, v, most in columns:
-            depth = max(q - high, 0.0) + min(q - low, 0.0)
+            depth = (high < FREE) * max(q - high, 0.0) + (low > -FREE) * min(q - low, 0.0)
             damping = LATE * k * min(1.0, abs(depth) / SPRING.edge)
             torque.append(clamp(-k * depth, most) - damping * v)
         return tuple(torque)
