@@ -189,15 +189,11 @@ def gradually(rig: Rig, duration: float, step: Callable[[float], None]) -> None:
         rig.clock.later(share * duration, partial(step, share))
 
 
-def request(name: str, then: str = "") -> Act:
-    """Return the act that asks the safety machine for something, and, `duration` s later, for something else."""
-
-    def inject(rig: Rig, duration: float = 0.0) -> None:
-        rig.between_cycles(getattr(rig.safety, name))
-        if then:
-            rig.clock.later(duration, partial(rig.between_cycles, getattr(rig.safety, then)))
-
-    return inject
+def request(name: str, then: str, rig: Rig, duration: float = 0.0) -> None:
+    """Ask the safety machine for something, and, `duration` s later, for something else, unless that is ''."""
+    rig.between_cycles(getattr(rig.safety, name))
+    if then:
+        rig.clock.later(duration, partial(rig.between_cycles, getattr(rig.safety, then)))
 
 
 def max_effort(rig: Rig, share: float) -> None:
@@ -232,25 +228,17 @@ def unplugged(rig: Rig, joint: int, duration: float = math.inf) -> None:
     rig.device.unplug(joint, duration)
 
 
-def frames_lost(which: str, ends: str) -> Act:
-    """Return the act that loses the frames of some motors: of the wire's set `which`, by the IDs named `ends`."""
-
-    def inject(rig: Rig, motors: Sequence[int], duration: float = math.inf) -> None:
-        ids = {getattr(rig.motors[joint].joint, ends) & ID_BITS for joint in motors}
-        lost: set[int] = getattr(rig.wire, which)
-        during(rig, duration, partial(lost.update, ids), partial(lost.difference_update, ids))
-
-    return inject
+def frames_lost(which: str, ends: str, rig: Rig, motors: Sequence[int], duration: float = math.inf) -> None:
+    """Lose the frames of some motors: of the wire's set `which`, by the IDs named `ends`."""
+    ids = {getattr(rig.motors[joint].joint, ends) & ID_BITS for joint in motors}
+    lost: set[int] = getattr(rig.wire, which)
+    during(rig, duration, partial(lost.update, ids), partial(lost.difference_update, ids))
 
 
-def motors_fail(name: str) -> Act:
-    """Return the act that sets a flag of the device for some motors, and clears that of all after a time."""
-
-    def inject(rig: Rig, motors: Sequence[int], duration: float = math.inf) -> None:
-        normal = [False] * len(rig.motors)
-        setting(rig, rig.device, name, [joint in motors for joint in range(len(normal))], normal, duration)
-
-    return inject
+def motors_fail(name: str, rig: Rig, motors: Sequence[int], duration: float = math.inf) -> None:
+    """Set a flag of the device for some motors, and clear that of all after a time."""
+    normal = [False] * len(rig.motors)
+    setting(rig, rig.device, name, [joint in motors for joint in range(len(normal))], normal, duration)
 
 
 def encoder_slip(rig: Rig, joint: int, error: float) -> None:
@@ -260,22 +248,14 @@ def encoder_slip(rig: Rig, joint: int, error: float) -> None:
     errors[joint] += error
 
 
-def attribute(owner: str, name: str, value: object, normal: object) -> Act:
-    """Return the act that gives an attribute of the rig's device or controller a value for a time."""
-
-    def inject(rig: Rig, duration: float = math.inf) -> None:
-        setting(rig, getattr(rig, owner), name, value, normal, duration)
-
-    return inject
+def attribute(owner: str, name: str, value: object, normal: object, rig: Rig, duration: float = math.inf) -> None:
+    """Give an attribute of the rig's device or controller a value for a time."""
+    setting(rig, getattr(rig, owner), name, value, normal, duration)
 
 
-def of_motor(name: str, normal: object) -> Act:
-    """Return the act that gives a motor's attribute a value for a time."""
-
-    def inject(rig: Rig, joint: int, value: object, duration: float = math.inf) -> None:
-        setting(rig, rig.motors[joint], name, value, normal, duration)
-
-    return inject
+def of_motor(name: str, normal: object, rig: Rig, joint: int, value: object, duration: float = math.inf) -> None:
+    """Give a motor's attribute a value for a time."""
+    setting(rig, rig.motors[joint], name, value, normal, duration)
 
 
 def motor_warms(rig: Rig, joint: int, most: float) -> None:
@@ -317,13 +297,9 @@ def resist(rig: Rig, duration: float) -> None:
     reach(rig, rig.device.arm.positions, duration)
 
 
-def trunk(action: str) -> Act:
-    """Return the act that turns the trunk by an angle in rad within `duration` s: 'bow' or 'lean'."""
-
-    def inject(rig: Rig, duration: float, **angle: float) -> None:
-        rig.act({action: angle[action], "over": duration}, {"hold": HOLD})
-
-    return inject
+def trunk(action: str, rig: Rig, duration: float, **angle: float) -> None:
+    """Turn the trunk by an angle in rad within `duration` s: 'bow' or 'lean'."""
+    rig.act({action: angle[action], "over": duration}, {"hold": HOLD})
 
 
 def payload_taken(rig: Rig, mass: float, told: float) -> None:
@@ -359,36 +335,36 @@ def imu_frozen(rig: Rig, duration: float = math.inf) -> None:
 
 ACTS: Mapping[str, Act] = {
     # The operator. `toggle` and `rearm` enable the arm `duration` s later.
-    "disable": request("disable"),
-    "enable": request("enable"),
-    "clear": request("clear"),
-    "resume": request("resume"),
-    "toggle": request("disable", then="enable"),
-    "rearm": request("clear", then="enable"),
+    "disable": partial(request, "disable", ""),
+    "enable": partial(request, "enable", ""),
+    "clear": partial(request, "clear", ""),
+    "resume": partial(request, "resume", ""),
+    "toggle": partial(request, "disable", "enable"),
+    "rearm": partial(request, "clear", "enable"),
     "settings": lambda rig, **changes: rig.change(**changes),
     "mode": mode,
     "max_effort": max_effort,
     # Hardware. `commands_lost` and `replies_lost` are lost on the bus; a motor that is `mute` sends none.
     "supply_cut": supply_cut,
     "unplugged": unplugged,
-    "commands_lost": frames_lost("commands_lost", "command_id"),
-    "replies_lost": frames_lost("replies_lost", "reply_id"),
-    "cut_off": motors_fail("cut_off"),
-    "mute": motors_fail("mute"),
-    "bus_silent": attribute("device", "bus_silent", True, False),
+    "commands_lost": partial(frames_lost, "commands_lost", "command_id"),
+    "replies_lost": partial(frames_lost, "replies_lost", "reply_id"),
+    "cut_off": partial(motors_fail, "cut_off"),
+    "mute": partial(motors_fail, "mute"),
+    "bus_silent": partial(attribute, "device", "bus_silent", True, False),
     "encoder_slip": encoder_slip,
     "encoder_jump": lambda rig, joint: encoder_slip(rig, joint, rig.motors[joint].joint.spec.rotor_turn),
-    "wrong_speed": lambda rig, joint, factor, duration: of_motor("speed_factor", 1.0)(rig, joint, factor, duration),
-    "torque_reversed": lambda rig, joint: of_motor("is_reversed", False)(rig, joint, True),
-    "motor_error": lambda rig, joint, code: of_motor("error", 0)(rig, joint, code),
-    "motor_hot": of_motor("temperature", 30.0),
+    "wrong_speed": lambda rig, joint, factor, duration: of_motor("speed_factor", 1.0, rig, joint, factor, duration),
+    "torque_reversed": lambda rig, joint: of_motor("is_reversed", False, rig, joint, True),
+    "motor_error": lambda rig, joint, code: of_motor("error", 0, rig, joint, code),
+    "motor_hot": partial(of_motor, "temperature", 30.0),
     "motor_warms": motor_warms,
     "foreign_torque": foreign_torque,
     # Computers.
     "stall": lambda rig, duration: setattr(rig.controller, "stall", duration),
     "efforts_late": efforts_late,
-    "efforts_withdrawn": attribute("controller", "change", withdrawn, None),
-    "efforts_nan": attribute("controller", "change", not_a_number, None),
+    "efforts_withdrawn": partial(attribute, "controller", "change", withdrawn, None),
+    "efforts_nan": partial(attribute, "controller", "change", not_a_number, None),
     # The wearer.
     "wearer": lambda rig, steps: rig.act(*steps),  # of a trial script
     "reach": reach,
@@ -398,8 +374,8 @@ ACTS: Mapping[str, Act] = {
     "payload_taken": payload_taken,
     "payload_dropped": payload_dropped,
     "out_of_cuff": out_of_cuff,
-    "bow": trunk("bow"),
-    "lean": trunk("lean"),
+    "bow": partial(trunk, "bow"),
+    "lean": partial(trunk, "lean"),
     # The IMU.
     "imu_wrong": imu_wrong,
     "imu_frozen": imu_frozen,
