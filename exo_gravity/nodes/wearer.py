@@ -91,6 +91,10 @@ class BudgetWatch:
             return
         self._checked, self.largest_support = carried, UNKNOWN
         try:
+            if len(bridge["motor"]) != len(names):
+                raise ParameterError(
+                    "motor", bridge["motor"], f"{len(names)} motors, one for each of {', '.join(names)}"
+                )
             tilt = math.radians(USUAL_TILT) if s.use_imu else 0.0
             bounds = workspace(bridge["position_min"], bridge["position_max"], tilt)
             joints = budget(*arms, springs, support, bounds, *motor_torques(bridge))

@@ -210,11 +210,9 @@ class VirtualClock:
         heapq.heappush(self._events, (self._after(delay), self._order, function))
         self._order += 1
 
-    def every(self, period: float, function: Callable[[], None]) -> Callable[[], None]:
-        """Call `function` every `period` s; return a function that ends it."""
-        ended: list[bool] = []
-        self.later(period, partial(self._repeat, period, function, ended))
-        return partial(ended.append, True)
+    def every(self, period: float, function: Callable[[], object]) -> None:
+        """Call `function` every `period` s from then on."""
+        self.later(period, partial(self._repeat, period, function))
 
     def stall(self, duration: float) -> None:
         """Let `duration` s pass in which nothing happens: it is all late then."""
@@ -234,10 +232,9 @@ class VirtualClock:
     def _after(self, duration: float) -> int:
         return self._nanoseconds + max(0, math.ceil(duration * 1e9))
 
-    def _repeat(self, period: float, function: Callable[[], None], ended: Sequence[bool]) -> None:
-        if not ended:
-            function()
-            self.later(period, partial(self._repeat, period, function, ended))
+    def _repeat(self, period: float, function: Callable[[], object]) -> None:
+        function()
+        self.every(period, function)
 
 
 class VirtualBus(can.BusABC):

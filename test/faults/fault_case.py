@@ -36,6 +36,11 @@ def pause(seconds: float) -> Action:
     return lambda rig: rig.run(seconds)
 
 
+def acting(does: Callable[..., object]) -> Callable[..., Action]:
+    """Let `does(rig, ...)` be called without the rig, and return the action."""
+    return lambda *args, **kwargs: lambda rig: does(rig, *args, **kwargs)
+
+
 @dataclass(frozen=True, eq=False)
 class Arm:
     """An arm of a file in config, carried in `pose` (n,) rad at `rate` Hz.

@@ -35,7 +35,7 @@ from ..support import CONFIG
 from ..support.launched_nodes import REAL, LaunchedNodes, children, executable, full_name
 from ..support.ros_probe import RosProbe
 from ..support.truth import Truth
-from .fault_case import BEFORE, PROCESS_REACTION, RECOVERY, Action, Arm, FaultCase, Parameters, in_turn, pause
+from .fault_case import BEFORE, PROCESS_REACTION, RECOVERY, Arm, FaultCase, Parameters, acting, in_turn, pause
 from .virtual_cases import ON_V3, SEVEN, Steps
 
 NEAR = 0.15  # rad from the pose, in which the arm need not be moved again
@@ -246,33 +246,27 @@ class ProcessRig:
                     stack.callback(nodes.stop)
 
 
-def send(number: int, *names: str) -> Action:
+@acting
+def send(rig: ProcessRig, number: int, *names: str) -> None:
     """Send a signal to processes."""
-
-    def inject(rig: ProcessRig) -> None:
-        for name in names:
-            os.kill(rig.pid(name), number)
-
-    return inject
+    for name in names:
+        os.kill(rig.pid(name), number)
 
 
-def publish(message_type: type, topic: str, make_message: Callable[[ProcessRig], Any]) -> Action:
+@acting
+def publish(rig: ProcessRig, message_type: type, topic: str, make_message: Callable[[ProcessRig], Any]) -> float:
     """Publish the message for half a second, from a publisher that does not belong to the arm."""
-
-    def inject(rig: ProcessRig) -> float:
-        publisher = rig.probe.node.create_publisher(message_type, topic, 1)
-        rig.probe.wait_until(lambda: publisher.get_subscription_count() > 0)
-        start = time.time()
-        for _ in range(50):  # a single message may be overwritten by the next regular one before it is read
-            message = make_message(rig)
-            if not message.header.stamp.sec:
-                message.header.stamp = rig.probe.node.get_clock().now().to_msg()
-            publisher.publish(message)
-            time.sleep(0.01)
-        rig.probe.node.destroy_publisher(publisher)
-        return start
-
-    return inject
+    publisher = rig.probe.node.create_publisher(message_type, topic, 1)
+    rig.probe.wait_until(lambda: publisher.get_subscription_count() > 0)
+    start = time.time()
+    for _ in range(50):  # a single message may be overwritten by the next regular one before it is read
+        message = make_message(rig)
+        if not message.header.stamp.sec:
+            message.header.stamp = rig.probe.node.get_clock().now().to_msg()
+        publisher.publish(message)
+        time.sleep(0.01)
+    rig.probe.node.destroy_publisher(publisher)
+    return start
 
 
 def states_at(rig: ProcessRig) -> JointState:
@@ -281,19 +275,16 @@ def states_at(rig: ProcessRig) -> JointState:
     return JointState(header=newest.header, name=newest.name, position=[1.0] * len(newest.name))
 
 
-def second_bridge(namespace: str) -> Action:
+@acting
+def second_bridge(rig: ProcessRig, namespace: str) -> None:
     """Start another bridge on the same bus, and wait for its end; see `has_refused`."""
-
-    def inject(rig: ProcessRig) -> None:
-        content = yaml.safe_load(rig.nodes.path.read_text())["/right/can_bridge"]
-        path = rig.folder / "second_bridge.yaml"
-        path.write_text(yaml.safe_dump({f"{namespace}/can_bridge": content}))
-        command = [executable("can_bridge"), "--ros-args", "-r", f"__ns:={namespace}", "--params-file", str(path)]
-        rig.second = None
-        with contextlib.suppress(subprocess.TimeoutExpired):
-            rig.second = subprocess.run(command, capture_output=True, text=True, timeout=START_LIMIT)
-
-    return inject
+    content = yaml.safe_load(rig.nodes.path.read_text())["/right/can_bridge"]
+    path = rig.folder / "second_bridge.yaml"
+    path.write_text(yaml.safe_dump({f"{namespace}/can_bridge": content}))
+    command = [executable("can_bridge"), "--ros-args", "-r", f"__ns:={namespace}", "--params-file", str(path)]
+    rig.second = None
+    with contextlib.suppress(subprocess.TimeoutExpired):
+        rig.second = subprocess.run(command, capture_output=True, text=True, timeout=START_LIMIT)
 
 
 def has_refused(rig: ProcessRig) -> None:

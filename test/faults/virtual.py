@@ -24,7 +24,7 @@ from exo_gravity.sim.rig import ACTS, HOLD, Rig
 from ..support import CONFIG
 from ..support.copies import copied
 from . import fault_case
-from .fault_case import BEFORE, Action, Arm, FaultCase, Parameters, Played, in_turn, pause
+from .fault_case import BEFORE, Action, Arm, FaultCase, Parameters, Played, acting, in_turn, pause
 
 TIMEOUTS: dict[str, Parameters] = {  # those of a real device
     "can_bridge": {"command_timeout": 0.05, "frozen_timeout": 0.08, "enable_timeout": 10.0, "sign_check_torque": 0.0},
@@ -190,15 +190,12 @@ def error_code(rig: StruckArm) -> int:
     return DAMIAO_ERROR if rig.motors[rig.struck].joint.spec.family == DAMIAO_MIT.family else AK_ERROR
 
 
-def power(on: bool, *joints: int) -> Action:
+@acting
+def power(rig: StruckArm, on: bool, *joints: int) -> None:
     """Switch the supply of these motors, by default of all; the encoders keep their turns."""
-
-    def inject(rig: StruckArm) -> None:
-        rig.catch_up()
-        for joint in joints or range(len(rig.motors)):
-            rig.motors[joint].unplugged = not on
-
-    return inject
+    rig.catch_up()
+    for joint in joints or range(len(rig.motors)):
+        rig.motors[joint].unplugged = not on
 
 
 def freeze(rig: StruckArm) -> None:
@@ -212,16 +209,14 @@ def resume(rig: StruckArm) -> None:
     rig.controller.change = None
 
 
-def change_efforts(change: Callable[[float, Sequence[float]], Sequence[float]]) -> Action:
+@acting
+def change_efforts(rig: StruckArm, change: Callable[[float, Sequence[float]], Sequence[float]]) -> None:
     """Spoil all efforts: change(now, efforts) gets s and (n,) Nm."""
 
-    def inject(rig: StruckArm) -> None:
-        def changed(answer: Efforts) -> Efforts:
-            return answer._replace(effort=tuple(change(rig.now, answer.effort))) if answer.effort else answer
+    def changed(answer: Efforts) -> Efforts:
+        return answer._replace(effort=tuple(change(rig.now, answer.effort))) if answer.effort else answer
 
-        rig.controller.change = changed
-
-    return inject
+    rig.controller.change = changed
 
 
 def exit_frame(rig: StruckArm) -> None:
@@ -234,17 +229,14 @@ def foreign(torque: float) -> Action:
     return in_turn(happens("foreign_torque", joint=struck, torque=torque, rate=500.0, duration=2.0), pause(2.0))
 
 
-def random_frames(ids: Iterable[int], count: int = 6000, rate: float = 3000.0) -> Action:
+@acting
+def random_frames(rig: StruckArm, ids: Iterable[int], count: int = 6000, rate: float = 3000.0) -> None:
     """Send frames of random length and content under random `ids`, `rate` a second."""
-
-    def inject(rig: StruckArm) -> None:
-        dice, known = random.Random(1), list(ids)
-        for number in range(count):
-            data, is_long = dice.randbytes(dice.randrange(9)), dice.random() < 0.2
-            message = can.Message(arbitration_id=dice.choice(known), data=data, is_extended_id=is_long)
-            rig.clock.later(number / rate, partial(rig.wire.carry, None, message))
-
-    return inject
+    dice, known = random.Random(1), list(ids)
+    for number in range(count):
+        data, is_long = dice.randbytes(dice.randrange(9)), dice.random() < 0.2
+        message = can.Message(arbitration_id=dice.choice(known), data=data, is_extended_id=is_long)
+        rig.clock.later(number / rate, partial(rig.wire.carry, None, message))
 
 
 def control_dies(rig: StruckArm) -> None:

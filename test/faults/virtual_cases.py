@@ -20,7 +20,7 @@ from exo_gravity.sim.rig import ACTS, IMU_PERIOD
 from exo_gravity.sim.virtual_arm import TrunkReading
 
 from ..support import CONFIG
-from .fault_case import ALL_JOINTS, PAPER, PROCESS_REACTION, Action, Arm, FaultCase, in_turn, pause
+from .fault_case import ALL_JOINTS, PAPER, PROCESS_REACTION, Action, Arm, FaultCase, acting, in_turn, pause
 from .virtual import (
     CONNECT,
     CUT,
@@ -185,14 +185,11 @@ def only_the_assistance_ends(records: np.ndarray, until: float = GONE_FOR) -> st
     return f"the arm moved by {motion:.2f} rad" if motion > MAX_MOTION else ""
 
 
-def outer_loop(**changes: Any) -> Action:
+@acting
+def outer_loop(rig: Any, **changes: Any) -> None:
     """Change what an outer loop does."""
-
-    def act(rig: Any) -> None:
-        for name, value in changes.items():
-            setattr(rig.outer_loop, name, value)
-
-    return act
+    for name, value in changes.items():
+        setattr(rig.outer_loop, name, value)
 
 
 def outer_loop_case(name: str, inject: Action, reason: str, **options: Any) -> FaultCase:
@@ -316,15 +313,12 @@ def stop_imu_for_a_moment(rig: StruckArm) -> None:
     rig.tell(rig.compensator, rig.newest_reading, rig.now - IMU_PERIOD / 2.0)
 
 
-def bow(pitch: float) -> Action:
+@acting
+def bow(rig: StruckArm, pitch: float) -> None:
     """Let the trunk turn to `pitch` rad, farther than a trial script may bow, at BOWING."""
-
-    def inject(rig: StruckArm) -> None:
-        count = round(abs(pitch - rig.device.pitch) / (BOWING * IMU_PERIOD))
-        for number, angle in enumerate(np.linspace(rig.device.pitch, pitch, 1 + count).tolist()):
-            rig.clock.later(number * IMU_PERIOD, partial(setattr, rig.device, "pitch", angle))
-
-    return inject
+    count = round(abs(pitch - rig.device.pitch) / (BOWING * IMU_PERIOD))
+    for number, angle in enumerate(np.linspace(rig.device.pitch, pitch, 1 + count).tolist()):
+        rig.clock.later(number * IMU_PERIOD, partial(setattr, rig.device, "pitch", angle))
 
 
 def unknown_states(rig: StruckArm) -> None:

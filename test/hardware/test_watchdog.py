@@ -68,7 +68,9 @@ class Bridge:
         self.log: list[str] = []
         self.inhibited: list[bool] = []
         self.command = command_of(self.notes.command.effort)
-        self.freeze = self.clock.every(CYCLE, lambda: self.notes.note(self.command))
+        self.alive = [True]
+        self.freeze = self.alive.clear
+        self.clock.every(CYCLE, lambda: self.alive and self.notes.note(self.command))
         self.listener = Responder(self.arm.wire)
 
     def kill(self) -> None:

@@ -660,6 +660,8 @@ def test_a_joint_that_is_not_listed_is_at_0_for_compensator_wearer_and_tools(alo
     watch = BudgetWatch(alone.wearer)
     alone.wait_until(lambda: watch.update(listed, of_tools.settings) or watch.result.code != Budget.UNKNOWN)
     assert watch.result.code == Budget.WITHIN_RATED
+    watch.update(names, replace(of_tools.settings, use_imu=True))  # a compensator of another arm than the bridge's
+    assert watch.result.code == Budget.UNKNOWN and "must be 3 motors" in watch.result.text
     for hand in ("", "hand"):  # of another arm than that which is estimated
         alone.wearer._on_parameters("", {**values, "urdf.hand": hand})
     assert alone.wearer._refusal.code == "refused_parameters"
