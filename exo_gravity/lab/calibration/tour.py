@@ -6,7 +6,7 @@ gravity, half of the difference is friction. The next pose is a given one, or th
 can hold. What holds the arm is expected with a mean and a standard deviation for every pose: by the fit of what this
 tour, and earlier ones, have measured so far. That carries the arm, and distinguishes a hand on it from its weight.
 
-Where motors vibrate the arm moves more slowly; a pose in which a joint sticks is left out. The tour begins and ends at
+A pose in which a joint sticks is left out. The tour begins and ends at
 the hanging arm; after trouble it withdraws its efforts. Its record has one line of JSON for each pose, as `calibrator`
 prints it.
 """
@@ -224,9 +224,8 @@ REFRESH_PERIOD = 0.1  # s between two estimates of the mass matrix, and of how u
 # What stops a tour.
 MAX_ERROR = 0.12  # rad between a joint and the slow reference
 FASTEST = 1.0  # rad/s of a joint; a light joint that leaves its friction reaches 0.5
-MAX_VIBRATIONS = 10  # of a motor, under the lowest gains
+MAX_VIBRATING = 1.0  # s for which a motor may vibrate
 MAX_CORRECTION = 0.5  # Nm, of the controllers, in addition to what is unknown of weight and friction
-SOFT = 1.5  # times both, under gains that were lowered because motors vibrated
 DEVIATIONS = 3.0  # of the expected torque
 UNKNOWN_FRICTION = 1.0  # Nm, until it is measured
 PERSISTENCE = 0.25  # s for which a torque must be unexplained
@@ -234,11 +233,10 @@ SATURATION = 0.1  # s for which a joint may want more than its max_effort
 MAX_GAP = 0.1  # s between two joint states; as long as can_bridge's longest time-out
 LONGEST_CHOICE = 30.0  # s for which the arm is held while the next pose is chosen
 MAX_TILT = 0.1  # rad by which the stand or the trunk may tilt during the tour
-HAND = "a hand is on the arm, or the joint is blocked"
-VIBRATED = (
-    "motors vibrated, as behind elastic joints, and the gains that stop this are too low for this file: correct "
-    "its masses and torque_scale, hang no weight, or stiffen the joint"
+VIBRATES = (
+    "its motor vibrates: is something loose? Stiffen an elastic joint, correct the file's masses, or hang no weight"
 )
+HAND = "a hand is on the arm, the joint is blocked, or it is elastic and needs stiffer parts or less weight"
 MAX_UNREST = (0.12, 0.25, 0.05)  # Nm, share of friction, share of the torque: between two passes of the same pose
 
 
@@ -319,39 +317,34 @@ class Tour:
             return f"the next pose was not chosen within {LONGEST_CHOICE:g} s: is this computer too busy?"
         if (moved := angle_between(tilt.direction, self._first_tilt.direction)) > MAX_TILT:
             return f"the trunk tilted by {moved:.2f} rad during the measurement, the limit is {MAX_TILT:g}"
-        tracker, most = self._tracker, MAX_ERROR * (SOFT if self._tracker.lowered else 1.0)
-        joints = zip(self._limits.joint_names, tracker.error, tracker.vibration.speed, tracker.vibrations, strict=True)
-        for name, behind, speed, vibrations in joints:
-            if not abs(behind) <= most:
-                return f"{name}: {abs(behind):.2f} rad off its path, the limit is {most:g}{self._because(HAND)}"
+        tracker = self._tracker
+        joints = zip(self._limits.joint_names, tracker.error, tracker.vibration.speed, tracker.vibrating, strict=True)
+        for name, behind, speed, vibrating in joints:
+            if not abs(behind) <= MAX_ERROR:
+                return f"{name}: {abs(behind):.2f} rad off its path, the limit is {MAX_ERROR:g}: {HAND}"
             if not abs(speed) <= FASTEST:
                 return f"{name}: {speed:.2f} rad/s, the limit is {FASTEST:g}: it slipped or was pushed"
-            if vibrations > MAX_VIBRATIONS:
-                return f"{name}: its motor goes on vibrating under the lowest gains: is something loose?"
+            if vibrating > MAX_VIBRATING:
+                return f"{name}: {VIBRATES}"
         return ""
 
     def _wrong_torque(self, dt: float) -> str:
         """Return which joint is saturated, or needs a torque that neither weight nor friction explains, or ''."""
         for i in np.flatnonzero(self._tracker.saturated > SATURATION):
             most = f"max_effort = {self._most[i]:g} Nm"
-            return f"{self._limits.joint_names[i]}: saturated: the pose needs more than {most}{self._because()}"
+            return f"{self._limits.joint_names[i]}: saturated: the pose needs more than {most}"
         torque, slide = self._tracker.correction, np.where(self.friction, 0.5 * self.friction, UNKNOWN_FRICTION)
-        limit = MAX_CORRECTION * (SOFT if self._tracker.lowered else 1.0) + DEVIATIONS * self._uncertain + slide
+        limit = MAX_CORRECTION + DEVIATIONS * self._uncertain + slide
         self._unexplained = np.where(np.abs(torque) > limit, self._unexplained + dt, 0.0)
         for i in np.flatnonzero(self._unexplained > PERSISTENCE):
             beyond = f"{torque[i]:.2f} Nm beyond its weight and friction, the limit is {limit[i]:.2f}"
-            return f"{self._limits.joint_names[i]}: {beyond}{self._because('is a hand on the arm?')}"
+            return f"{self._limits.joint_names[i]}: {beyond}: is a hand on the arm?"
         return ""
 
     @property
     def down(self) -> np.ndarray:
         """Gravity's unit vector (3,) in the base frame."""
         return self.guess.model.down(self._tilt)
-
-    def _because(self, usual: str = "") -> str:
-        """Return what ended the tour, after a colon: vibration if it has lowered the gains, else the `usual` reason."""
-        reason = VIBRATED if self._tracker.lowered else usual
-        return f": {reason}" if reason else ""
 
     def plan(self) -> None:
         """Fit what was measured, and choose the next pose, if one is due.
@@ -399,10 +392,9 @@ class Tour:
         """Yield each sweep until enough were good, and keep what they show; or leave the pose out if a joint sticks."""
         failures, sweeps = 0, list[Sweep]()
         while len(sweeps) < 2 * station.cycles:
-            lowered = self._tracker.lowered
+            frequency = self._tracker.frequency
             pair = yield from self._tracker.sweep(station)
-            if self._tracker.lowered != lowered:
-                # Sweep again: neither friction nor gravity shows while motors vibrate.
+            if self._tracker.frequency < frequency:  # neither friction nor gravity shows while motors vibrate
                 sweeps = []
                 continue
             share, was_known = followed(pair, station), bool(np.any(self.friction))

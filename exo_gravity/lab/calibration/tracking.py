@@ -10,10 +10,8 @@ frequency that it is given, however they are coupled.
 
 Behind an elastic joint the links no longer hold the rotor: above their resonance the controller moves the rotor alone,
 which has 1 to 20 % of the inertia that the gains are for. An AK60-6 on 1,000 Nm/rad rings at 170 Hz, beyond what 250 Hz
-sample. Nobody knows that before the first tour. So the tracker begins with the gains of a rigid arm, which pass
-Stribeck friction best. When a motor vibrates, it lowers the gains of all joints, then further those of each whose motor
-still does, and the speed with them. Lowered gains pass a low-pass filter, which leaves nothing of them at the rotor's
-frequencies.
+sample. So the gains are low, and pass a low-pass filter which leaves nothing of them at the rotor's frequencies. Where
+a motor vibrates all the same, they become lower for all.
 """
 
 import math
@@ -49,20 +47,18 @@ class TrackerTuning:
     added: float = 0.005
     #: natural frequency in rad/s per control cycle per s; two cycles of delay cost 27 degrees
     frequency_per_rate: float = 0.12
-    max_frequency: float = 20.0  #: rad/s
-    soft_frequency: float = 8.0  #: rad/s, the most once a motor has vibrated
-    softer: float = 0.7  #: of the frequency, each time that a motor vibrates still
-    slowest: float = 0.1  #: rad/s: the speed falls to it with a frequency below soft_frequency
+    max_frequency: float = 8.0  #: rad/s
+    calm: float = 0.3  #: s for which a motor may vibrate, before all gains become
+    softer: float = 0.6  #: of this frequency
     least_frequency: float = 2.5  #: rad/s: 0.6 kg m^2 on 150 Nm/rad oscillate with 5, at 10 Hz (measured)
-    #: times the frequency, where the low-pass filter of lowered gains begins: three of them in a row cost 35 degrees
-    #: where the gain is 1, and leave 3 % of it at twice the frequency that the filter begins with
+    #: times the frequency, where the low-pass filter of the gains begins: three of them in a row cost 35 degrees where
+    #: the gain is 1, and leave 3 % of it at twice the frequency that the filter begins with
     filtered_from: float = 10.0
     filter_order: int = 3  #: of first-order filters in a row
     swing: float = 0.07  #: rad/s off a motor's mean speed, on both sides: three steps of its 12 bits
     mean_speed: float = 0.04  #: s, time constant of that mean
     slowest_swing: float = 0.06  #: s from one side to the other; the controller's own motion is slower
     swings: int = 6  #: in a row, which are a vibration: a joint that leaves its friction swings twice
-    calm: float = 0.3  #: s in which a vibration may fade under lower gains
     integral_share: float = 0.4  #: of the frequency, at which the integral part acts; unstable from 2 on
     #: times the smallest inertia in any direction, that the integral part adds in all. Without it, two joints that
     #: stick on opposite sides of their path would cancel each other's integral where the inertia of both is small.
@@ -201,10 +197,6 @@ class Vibration:
         self._swings = np.where(goes_on, self._swings + is_turned, 0.0)
         return np.asarray(self._swings >= TRACKER.swings)
 
-    def forget(self) -> None:
-        """Count the swings of all motors anew."""
-        self._swings = 0.0 * self._swings
-
 
 class Tracker:
     """Moves all joints along lines, one after the other, and takes the samples of sweeps.
@@ -217,8 +209,8 @@ class Tracker:
     saturated: (n,) s for which each joint has wanted more than its `max_effort`.
     error: (n,) rad by which the arm is behind its path.
     correction: (n,) Nm, what the controller added to gravity and friction in the last step.
-    vibration: of the motors. lowered: how often gains were lowered because motors vibrated.
-    vibrations: (n,) how often each joint's motor has vibrated under the lowest gains.
+    frequency: rad/s, of each joint under the present gains.
+    vibration: of the motors. vibrating: (n,) s for which each joint's motor has vibrated under these gains.
     """
 
     def __init__(self, rate: float, max_effort: Sequence[float]) -> None:
@@ -227,11 +219,9 @@ class Tracker:
         self.saturated = np.zeros(count)
         self.error = np.zeros(count)
         self.correction = np.zeros(count)
-        self.lowered = 0
-        self.vibrations = np.zeros(count)
+        self.vibrating = np.zeros(count)
         self.vibration = Vibration(count)
-        self._frequency = np.full(count, min(TRACKER.max_frequency, TRACKER.frequency_per_rate * rate))  # rad/s
-        self._calm = 0.0  # s left to calm down
+        self.frequency = min(TRACKER.max_frequency, TRACKER.frequency_per_rate * rate)
         self._filter = np.zeros((TRACKER.filter_order, count))  # Nm, what each filter passes
         self._max_effort = np.array(max_effort)
         self._integral = np.zeros(count)
@@ -271,7 +261,6 @@ class Tracker:
         # The path does not wait for a joint that is ahead: it would not come back against its friction.
         behind = float(np.where(self._line.way, self.error * self._line.way, np.abs(self.error)).max())
         pace = max(0.0, min(1.0, (TRACKER.stop_error - behind) / (TRACKER.stop_error - TRACKER.slow_error)))
-        pace = min(pace, self.fastest / self._line.speed) if self._line.duration else pace
         self._time += pace * dt
         if self._samples is not None and self._line.is_measured(self._time):
             # The effort of the last cycle brought the arm here.
@@ -279,36 +268,12 @@ class Tracker:
         # Friction is compensated before the motion begins: a joint that breaks away late would jump.
         coming = self._line.at(self._time + MOTION.lead)[1] if self._time < MOTION.lead else heading
         speed_error = pace * heading - velocity
-        self._watch_vibration(dt, velocity)
+        self.vibrating = np.where(self.vibration.step(dt, velocity), self.vibrating + dt, 0.0)
+        if np.any(self.vibrating > TRACKER.calm) and self.frequency > TRACKER.least_frequency:
+            self.frequency, self.vibrating = TRACKER.softer * self.frequency, 0.0 * self.vibrating
         self._compensate_friction(dt, coming, speed_error)
         self._effort = self._controlled(dt, speed_error, expected, matrix + TRACKER.added * np.eye(len(matrix)))
         return self._effort
-
-    @property
-    def fastest(self) -> float:
-        """The speed in rad/s at which the arm may be moved.
-
-        It falls with lowered gains: so does the rate at which the integral part follows a torque that differs from what
-        was expected.
-        """
-        share = float(self._frequency.min()) / TRACKER.soft_frequency if self.lowered else 1.0
-        return max(TRACKER.slowest, min(1.0, share) * MOTION.speed)
-
-    def _watch_vibration(self, dt: float, velocity: Vector) -> None:
-        """Lower the gains where a motor vibrates, without a step of what they hold; velocity: (n,) rad/s."""
-        self._calm = max(0.0, self._calm - dt)
-        vibrates, present = self.vibration.step(dt, velocity), self._frequency
-        if self._calm or not vibrates.any():
-            return
-        self.vibrations += vibrates & (present <= TRACKER.least_frequency)
-        # At first those of all joints: the others are about to.
-        softer = np.where(vibrates, TRACKER.softer * present, present) if self.lowered else TRACKER.soft_frequency
-        self._frequency = np.maximum(TRACKER.least_frequency, np.minimum(softer, present))
-        left = (self._frequency / present) ** 2
-        self._calm, self.lowered = TRACKER.calm, self.lowered + 1
-        self._integral += (1.0 - left) * self._filter[-1]
-        self._filter *= left
-        self.vibration.forget()
 
     def _compensate_friction(self, dt: float, heading: np.ndarray, speed_error: np.ndarray) -> None:
         """Compensate friction by and by towards `heading` (n,) rad/s, and no further in a joint that is ahead."""
@@ -319,9 +284,9 @@ class Tracker:
         self._slide += np.where(is_ahead & (change * way > 0.0), 0.0, change)
 
     def _controlled(self, dt: float, speed_error: np.ndarray, expected: Torque, matrix: np.ndarray) -> Torque:
-        frequency, weakest = self._frequency, float(np.linalg.eigvals(matrix).real.min())
-        root, stiff = np.sqrt(frequency), frequency * (matrix @ (frequency * self.error))
-        push = self._filtered(dt, stiff + 2.0 * root * (matrix @ (root * speed_error)))
+        frequency, weakest = self.frequency, float(np.linalg.eigvals(matrix).real.min())
+        stiff = frequency**2 * (matrix @ self.error)
+        push = self._filtered(dt, stiff + 2.0 * frequency * (matrix @ speed_error))
         floor = TRACKER.floor * weakest * self.error * frequency**2
         integral = self._integral + TRACKER.integral_share * frequency * dt * (stiff + floor)
         torque = expected + self._slide + push + integral
@@ -333,9 +298,9 @@ class Tracker:
         return tuple(np.clip(torque, -self._max_effort, self._max_effort).tolist())
 
     def _filtered(self, dt: float, push: np.ndarray) -> np.ndarray:
-        """Return `push` (n,) Nm, of lowered gains without what the rotor could vibrate with."""
-        passed, value = 1.0 - np.exp(-TRACKER.filtered_from * self._frequency * dt), push
+        """Return `push` (n,) Nm without what a rotor could vibrate with."""
+        passed = 1.0 - math.exp(-TRACKER.filtered_from * self.frequency * dt)
         for stage in self._filter:
-            stage += passed * (value - stage)
-            value = stage
-        return value.copy() if self.lowered else push
+            stage += passed * (push - stage)
+            push = stage
+        return push.copy()

@@ -81,7 +81,7 @@ def test_a_tour_of_two_poses_is_slow_ends_hanging_in_time_and_does_not_watch_the
     positions = np.array(run.log)[:, 1:5]
     np.testing.assert_allclose(positions[-1], LIMITS.home, atol=0.1)
     assert run.fastest < 0.9  # for moments, where a light joint leaves its friction
-    assert np.abs(np.diff(positions[:: round(0.5 * run.rate)], axis=0)).max() / 0.5 < 1.3 * MOTION.speed
+    assert np.abs(np.diff(positions[:: round(0.5 * run.rate)], axis=0)).max() / 0.5 < 1.35 * MOTION.speed
     later = [tour.step(1000.0 + n / 100.0, (0.0, 0.5, 0.4, 0.8), STILL, UPRIGHT) for n in range(300)]
     assert None not in later and not tour.trouble
 
@@ -196,21 +196,6 @@ def test_the_arm_is_held_until_the_next_pose_is_chosen_but_not_for_ever_and_not_
     tour.plan()
     assert None in [tour.step(0.01 * cycle, STILL, STILL, UPRIGHT) for cycle in range(1, 40)]  # let down by the bridge
     assert tour.trouble == "the next pose could not be chosen: LinAlgError: Singular matrix"
-
-
-def test_a_pose_is_swept_again_if_motors_vibrated_in_it(monkeypatch):
-    tour, frictions, way = Tour(LIMITS, MODEL, fixed([POSE]), 100.0), [0.2, 0.9, 0.2, 0.2], np.linspace(-0.03, 0.03, 20)
-    position, down = np.array(POSE.theta) + way[:, None], np.tile((0.0, 0.0, 1.0), (20, 1))
-
-    def sweep(station):
-        yield from ()
-        friction = np.full((20, 4), frictions.pop(0))
-        tour._tracker.lowered += len(frictions) == 2  # in the second pair
-        return [Sweep(position, friction, down), Sweep(position[::-1], -friction, down)]
-
-    monkeypatch.setattr(tour._tracker, "sweep", sweep)
-    assert list(tour._sweeps(POSE)) == []
-    np.testing.assert_allclose(tour.measured[0].friction, 0.2)
 
 
 def test_poses_in_which_a_joint_sticks_are_left_out_and_the_tour_ends_with_what_it_has(monkeypatch):
@@ -408,7 +393,7 @@ def test_a_tour_of_an_elastic_arm_ends_with_the_true_torques_of_its_links(
         np.testing.assert_allclose(one.effort, needed, atol=0.03 + 2.0 * play)
 
 
-def test_a_tour_that_soft_joints_end_says_that_motors_vibrated():
+def test_a_tour_that_soft_joints_end_says_so():
     links, weight = DEFAULT_LINKS, (1.0, 0.28)  # kg, m from the elbow
     truth = ArmConfig(
         ArmModel(links.length, links.cog, links.mass * (1.1, 0.85, 0.7, 0.7)), joint_stiffness=(150.0,) * 4,
@@ -416,5 +401,5 @@ def test_a_tour_that_soft_joints_end_says_that_motors_vibrated():
     )  # fmt: skip
     motors = [replace(motor, torque_scale=1.2) for motor in MOTORS_AS_MOUNTED]
     tour = TourRun(truth=truth, motors=motors, tilt=(0.05, 0.2), rate=250.0, load=weight).run(fixed(TWO_FAR[1:]))
-    assert "motors vibrated, as behind elastic joints" in tour.trouble
+    assert "it is elastic" in tour.trouble
     assert not tour.done
