@@ -235,14 +235,9 @@ def _knowing(record: Path | None) -> dict[str, Any]:
 
 
 def places_of(options: argparse.Namespace) -> Places:
-    """Return how exactly zeros and axes are known, by default as usual. Raises ParameterError."""
-    given = {"zero": ("zeros", options.zeros), "axis": ("axes", options.axes)}
-    known = {
-        field: math.radians(one_float(name, degrees, 0.0, MOST_OFF, "degrees"))
-        for field, (name, degrees) in given.items()
-        if degrees is not None
-    }
-    return Places(**known)
+    """Return how exactly zeros and axes are known, both in degrees. Raises ParameterError."""
+    known = (("zeros", options.zeros), ("axes", options.axes))
+    return Places(*(math.radians(one_float(name, one, 0.0, MOST_OFF, "degrees")) for name, one in known))
 
 
 def tour_observations(
@@ -313,7 +308,7 @@ def moments_from(
     poses, taken = candidates(arm.limits, model), [one.theta for one in observations]
     best = poses[next_pose(taken, poses, observations[-1].direction, model.moments, model)]
     more = f"next best pose, if more is wanted: {' '.join(f'{angle:.0f}' for angle in np.degrees(best))} degrees"
-    changes, lines = _changes(arm, model, found, scale), (*_lines(arm, found), more)
+    changes, lines = tuple(_changes(arm, model, found, scale)), (*_lines(arm, found), more)
     return CalibrationResult(changes, lines, impossible, arm, model, tuple(observations), found)
 
 
@@ -333,38 +328,43 @@ def _scale_before(arm: ConfiguredArm, found: Identified) -> np.ndarray:
     return np.array([scale_at(*motor) if math.isfinite(motor[-1]) else motor[0] for motor in motors])
 
 
-def _moment_changes(arm: ConfiguredArm, model: MomentModel, found: Identified) -> Iterator[Change]:
-    """Yield the new moments. What is unknown keeps its value."""
-    node, before, error = f"{arm.namespace}/compensator", model.moments, found.error.moment
+def _changes(arm: ConfiguredArm, model: MomentModel, found: Identified, scale: list[float]) -> Iterator[Change]:
+    """Yield the new values of the parameter file; scale: (n,), the torque scales."""
+    compensator, bridge = f"{arm.namespace}/compensator", f"{arm.namespace}/can_bridge"
+    value, error, old = found.value, found.error, arm.can_bridge
     unit = "as commanded; in kg m once a weight was hung" if found.relative else "kg m"
-    known = f"{unit}, +-{np.max(error, where=np.isfinite(error), initial=0.0):.2g} at most"
-    for name, values in model.in_file(found.value.moment, found.value.turn).items():
+    known = np.max(error.moment, where=np.isfinite(error.moment), initial=0.0)
+    for name, values in model.in_file(value.moment, value.turn).items():
         if part := MOMENT_PARAMETERS.get(name):
-            note = f"{' '.join(model.names[part])} {unit}, +-{row(error[part])}, was {row(before[part])}"
+            note = f"{' '.join(model.names[part])} {unit}, +-{row(error.moment[part])}, was {row(model.moments[part])}"
         else:
-            note = f"{'rad' if name in TURN_NAMES else known}, was {row(np.array(arm.compensator[name]))}"
-        yield Change(node, name, (values.round(5) + 0.0).tolist(), note)
-
-
-def _changes(arm: ConfiguredArm, model: MomentModel, found: Identified, scale: list[float]) -> tuple[Change, ...]:
-    """Return the new values of the parameter file."""
-    node, changes = f"{arm.namespace}/compensator", [*_moment_changes(arm, model, found)]
-    changes += [
-        Change(f"{arm.namespace}/can_bridge", "torque_scale", scale, f"+-{row(found.error.scale)}"),
-        *_zero_changes(arm, found),
-        *_temperature_changes(arm, found),
-        *_spring_changes(arm, found),
-    ]
+            kind = "rad" if name in TURN_NAMES else f"{unit}, +-{known:.2g} at most"
+            note = f"{kind}, was {row(np.array(arm.compensator[name]))}"
+        yield Change(compensator, name, (values.round(5) + 0.0).tolist(), note)
+    yield Change(bridge, "torque_scale", scale, f"+-{row(error.scale)}")
+    zero, degrees = value.turn[:, 0], np.degrees((value.turn[:, 0], error.turn[:, 0]))
+    # A zero that no pose shows keeps the value of the file, and its error means nothing.
+    shown = row(np.where(degrees[1] > 1e-3, degrees[1], np.nan))
+    note = f"rad; the joints are {row(degrees[0])} degrees farther than the file said, +-{shown} degrees"
+    zeros = np.array(old["zero"]) - np.array(old["direction"]) * zero
+    yield Change(bridge, "zero", (zeros.round(5) + 0.0).tolist(), note)
+    if np.all(np.isfinite(found.temperature)):
+        yield Change(bridge, "torque_scale_temperature", found.temperature.round(1).tolist(), "degC, mean of the tours")
+        given = np.array(old["torque_scale_slope"])
+        if np.any(given) or np.any(value.slope):
+            slope = given * old["torque_scale"] / _scale_before(arm, found) + value.slope
+            note = f"1/K, +-{row(error.slope)}; 0: the poses show none, the file's is kept"
+            yield Change(bridge, "torque_scale_slope", slope.round(5).tolist(), note)
+    yield from _spring_changes(arm, found)
     note = "Nm, in poses that no tour visited"
-    changes.append(Change(node, "model_error.torque", found.torque_error.round(4).tolist(), note))
+    yield Change(compensator, "model_error.torque", found.torque_error.round(4).tolist(), note)
     if not found.relative:
-        known = np.isfinite(found.error.scale)
-        share = np.where(known, found.error.scale / found.value.scale, for_joints(ModelError().scale, len(scale), max))
-        changes.append(Change(node, "model_error.scale", share.round(4).tolist(), "share of torque_scale"))
-    changes += exact_law(arm)
+        is_known = np.isfinite(error.scale)
+        share = np.where(is_known, error.scale / value.scale, for_joints(ModelError().scale, len(scale), max))
+        yield Change(compensator, "model_error.scale", share.round(4).tolist(), "share of torque_scale")
+    yield from exact_law(arm)
     if any(gain != 1.0 for gain in arm.compensator["gain"]):
-        changes.append(Change(node, "gain", [1.0] * len(scale), "now part of the moments and of torque_scale"))
-    return tuple(changes)
+        yield Change(compensator, "gain", [1.0] * len(scale), "now part of the moments and of torque_scale")
 
 
 def exact_law(arm: ConfiguredArm) -> Iterator[Change]:
@@ -374,40 +374,13 @@ def exact_law(arm: ConfiguredArm) -> Iterator[Change]:
         yield Change(node, "law", "exact", "the other laws need masses and centres of gravity")
 
 
-def _zero_changes(arm: ConfiguredArm, found: Identified) -> Iterator[Change]:
-    """Yield the zeros of the encoders."""
-    bridge, (degrees, error) = arm.can_bridge, np.degrees((found.value.turn[:, 0], found.error.turn[:, 0]))
-    zero = np.array(bridge["zero"]) - np.array(bridge["direction"]) * found.value.turn[:, 0]
-    # A zero that no pose shows keeps the value of the file, and its error means nothing.
-    note = (
-        f"rad; the joints are {row(degrees)} degrees farther than the file said, "
-        f"+-{row(np.where(error > 1e-3, error, np.nan))} degrees"
-    )
-    yield Change(f"{arm.namespace}/can_bridge", "zero", (zero.round(5) + 0.0).tolist(), note)
-
-
-def _temperature_changes(arm: ConfiguredArm, found: Identified) -> Iterator[Change]:
-    """Yield at which temperatures the torque scales are true, and their slopes."""
-    node, bridge = f"{arm.namespace}/can_bridge", arm.can_bridge
-    if not np.all(np.isfinite(found.temperature)):
-        return
-    yield Change(node, "torque_scale_temperature", found.temperature.round(1).tolist(), "degC, mean of the tours")
-    given = np.array(bridge["torque_scale_slope"])
-    if np.any(given) or np.any(found.value.slope):
-        slope = given * bridge["torque_scale"] / _scale_before(arm, found) + found.value.slope
-        note = f"1/K, +-{row(found.error.slope)}; 0: the poses show none, the file's is kept"
-        yield Change(node, "torque_scale_slope", slope.round(5).tolist(), note)
-
-
 def _spring_changes(arm: ConfiguredArm, found: Identified) -> Iterator[Change]:
     """Yield the device's own springs, and the torque that they may add beyond gravity, where the file states one."""
-    node, before = f"{arm.namespace}/compensator", joint_spring_of(arm.compensator)
-    if not (np.any(found.value.spring) or before.on):
+    node, before, value = f"{arm.namespace}/compensator", joint_spring_of(arm.compensator), found.value
+    if not (np.any(value.spring) or before.on):
         return
-    value = found.value
     slack = value.turn[:, 0] - value.offset * value.scale / np.where(value.spring > 0.0, value.spring, np.inf)
-    rest = np.clip(slack, -MAX_REST, MAX_REST).round(4)
-    new = Springs(value.spring.round(4).tolist(), rest.tolist())
+    new = Springs(value.spring.round(4).tolist(), np.clip(slack, -MAX_REST, MAX_REST).round(4).tolist())
     note = f"Nm/rad, +-{row(found.error.spring)}; 0: the poses show none"
     yield Change(node, "joint_spring.stiffness", list(new.stiffness), note)
     yield Change(node, "joint_spring.rest", list(new.rest), "rad, with the offset of the motor")
@@ -451,7 +424,8 @@ def checked(arm: ConfiguredArm, observations: Sequence[Observation]) -> Calibrat
     held, (*_, effort, spread) = _needed(arm, model_of(arm), observations), columns(observations)
     size = np.sqrt(np.mean(held**2, axis=0))
     noise = np.sqrt(np.sum((held * spread) ** 2, axis=0)) / np.maximum(len(held) * size, 1e-9)  # Nm, of this tour
-    error = np.hypot(for_joints(stated_error(arm), len(arm.joint_names), max), noise)
+    stated = arm.compensator.get("model_error.torque", ModelError().torque)
+    error = np.hypot(for_joints(stated, len(arm.joint_names), max), noise)
     share = np.sum(held * effort, axis=0) / np.maximum(np.sum(held**2, axis=0), 1e-12)  # of the command that was enough
     band = 100.0 * COVER * error / np.maximum(size, 1e-9)
     now, then = temperatures(observations).mean(axis=0), arm.can_bridge["torque_scale_temperature"]
@@ -466,12 +440,6 @@ def checked(arm: ConfiguredArm, observations: Sequence[Observation]) -> Calibrat
         sentence = f"{name}: {what} than when it was calibrated, at {then[n]:g} degC{warmth}"
         (refusals if abs(less) > max(band[n], CHECK.least) else lines).append(sentence)
     return CalibrationResult((), tuple(lines), tuple(refusals), arm, observations=tuple(observations))
-
-
-def stated_error(arm: ConfiguredArm) -> Sequence[float]:
-    """Return the file's `model_error.torque`, or its default, in Nm."""
-    error: Sequence[float] = arm.compensator.get("model_error.torque", ModelError().torque)
-    return error
 
 
 def calibrate_friction(options: argparse.Namespace, arm: ConfiguredArm, say: Say) -> CalibrationResult:
