@@ -353,7 +353,6 @@ def test_a_pose_that_was_left_out_is_not_counted_and_a_refusal_is_on_the_page_wi
     touched = outcome(touched=1.0)
     *_, used = remainders_of(touched)
     assert np.flatnonzero(~used).tolist() == [5]
-    assert " of 11 poses with the old file" in page_of(touched, "gravity", "old.yaml", DAY)
     page = page_of(replace(found, refusals=("pose 3 slipped",), identified=None), "gravity", "old.yaml", DAY)
     assert "Not calibrated" in page and "<li>pose 3 slipped</li>" in page
     assert "robot.first_moment" not in page and "<img" not in page

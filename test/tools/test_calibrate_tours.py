@@ -14,7 +14,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from exo_gravity.core import ArmModel, gravity_torque
+from exo_gravity.core import ArmModel
 from exo_gravity.core.arm.springs import Springs
 from exo_gravity.core.arm.tilt import Tilt
 from exo_gravity.core.compensation.settings import robot_of, settings_of
@@ -223,17 +223,6 @@ def test_recordings_without_and_with_the_weight_give_kilograms_and_true_scales(t
     np.testing.assert_allclose(found.robot.first_moment[1:], TRUTH.first_moment[1:], rtol=0.04)
 
 
-def test_held_poses_are_as_uncertain_as_friction(tmp_path):
-    poses = np.random.default_rng(5).uniform((-1.0, 0.2, -0.3, 0.2), (1.0, 1.6, 1.5, 1.8), (6, 4))
-    position, time = np.repeat(poses, 300, axis=0), 0.01 * np.arange(1800) + np.repeat(5.0 * np.arange(6), 300)
-    unknown = np.full_like(position, np.nan)
-    holds = Recording("right", ARM.joint_names, time, position, unknown, gravity_torque(TRUTH, position), unknown)
-    upright = replace(ARM, compensator={**ARM.compensator, "use_imu": False})
-    found = recorded.observations_of(write_bag(tmp_path / "bag", messages(holds)), upright, PAPERS)
-    np.testing.assert_allclose([o.theta for o in found], poses, atol=1e-3)
-    assert np.min([o.spread for o in found]) > 0.2
-
-
 def test_friction_of_each_joint_is_fitted_and_noted_in_the_file():
     (one, *_), slide = Device(8).tour(bare=1, weighed=0), np.array((0.2, 0.4, 0.1, 0.3))
     speeds = (0.02, 0.05, 0.1, 0.18, 0.3)
@@ -252,7 +241,7 @@ def test_sweeps_at_five_speeds_give_the_friction_of_each_joint_live_and_recorded
     assert tour.trouble == ""
     for measured in (
         tour.measured,
-        recorded.observations_of(recorded_by(run, tmp_path / "bag"), ARM, PAPERS, with_held=False),
+        recorded.observations_of(recorded_by(run, tmp_path / "bag"), ARM, PAPERS),
     ):
         result = friction_from(ARM, measured)
         assert result.refusals == ()

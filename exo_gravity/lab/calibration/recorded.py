@@ -1,9 +1,5 @@
 # Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
-"""Observations from a recording: poses that were passed slowly in both directions, and poses that were held.
-
-A pose that was passed there and back gives gravity and friction. A held pose gives gravity to within friction only: the
-arm would stay with any torque inside it.
-"""
+"""Observations from a recording: poses that were passed slowly in both directions give gravity and friction."""
 
 import math
 from collections.abc import Iterator
@@ -19,32 +15,29 @@ from exo_gravity.lab.bag.content import TILT_TOPIC, Bag
 from exo_gravity.lab.bag.reader import read_bag
 from exo_gravity.lab.bag.storage import Decoder, Storage
 from exo_gravity.lab.calibration.moment_model import MomentModel
-from exo_gravity.lab.calibration.tracking import MOTION, Observation, Sweep, average, mean_direction
+from exo_gravity.lab.calibration.tracking import MOTION, Observation, Sweep, average
 from exo_gravity.lab.inputs.arms import ConfiguredArm
-from exo_gravity.lab.trial.analysis import Recording, in_blocks, still_spans
+from exo_gravity.lab.trial.analysis import Recording
 
 
 @dataclass(frozen=True)
 class Detection:
-    """What counts as a sweep there and back, and as a held pose."""
+    """What counts as a sweep there and back."""
 
-    speed: tuple[float, float] = (0.008, 0.35)  #: rad/s: slower is held, faster has inertia
+    speed: tuple[float, float] = (0.008, 0.35)  #: rad/s: slower may stick, faster has inertia
     window: float = 0.2  #: s over which the speed is taken
     edge: float = 0.25  #: of the common way of two sweeps, left out at each end, where they turn
     least_way: float = 0.03  #: rad that each joint must turn in both directions
     longest_turn: float = 3.0  #: s between a sweep and the one back
-    held_time: float = 1.0  #: s for which a pose must be held
-    unknown_friction: float = 0.4  #: Nm, of a joint of which no sweep was recorded
 
 
 DETECTION = Detection()
 
 
-def observations_of(path: Path, arm: ConfiguredArm, model: MomentModel, with_held: bool = True) -> list[Observation]:
-    """Return the observations in the recording of `arm` at `path`: sweeps there and back, and poses held.
+def observations_of(path: Path, arm: ConfiguredArm, model: MomentModel) -> list[Observation]:
+    """Return the observations in the recording of `arm` at `path`: sweeps there and back.
 
     model: of the arm, which has its base frame.
-    with_held: False for sweeps alone, which show friction.
 
     Raises DataError if there are none.
     """
@@ -52,13 +45,9 @@ def observations_of(path: Path, arm: ConfiguredArm, model: MomentModel, with_hel
     recording = recording_of(bag, arm)
     effort = np.where(np.isfinite(recording.command), recording.command, recording.effort)  # as commanded, where known
     recording = replace(recording, position=recording.position.astype(float), effort=effort)
-    down = _down(bag, arm, model, recording.time)
-    observations = list(_sweeps(recording, down))
-    if with_held:
-        observations += list(_held(recording, down, observations))
+    observations = list(_sweeps(recording, _down(bag, arm, model, recording.time)))
     if not observations:
-        held = f", or held one for {DETECTION.held_time:g} s" if with_held else ""
-        raise DataError(f"{path}: {arm.name} never passed a pose slowly there and back, all joints turning{held}")
+        raise DataError(f"{path}: {arm.name} never passed a pose slowly there and back, all joints turning")
     return observations
 
 
@@ -141,17 +130,3 @@ def _runs(recording: Recording, start: float, end: float) -> Iterator[slice]:
     for low, high in pairwise(edges.tolist()):
         if is_slow[low] and high - low > 4 * MOTION.bins:
             yield slice(int(first) + low, int(first) + high)
-
-
-def _held(recording: Recording, down: np.ndarray, sweeps: list[Observation]) -> Iterator[Observation]:
-    """Yield an observation for every pose that was held, as uncertain as the friction of `sweeps`."""
-    friction = np.full(recording.position.shape[1], DETECTION.unknown_friction)
-    if sweeps:
-        friction = np.abs(np.median([sweep.friction for sweep in sweeps], axis=0))
-    for start, end in still_spans(recording, in_blocks(recording)):
-        if end - start >= DETECTION.held_time:
-            part = (recording.time >= start) & (recording.time <= end)
-            effort = recording.effort[part]
-            spread = np.hypot(friction / math.sqrt(3.0), effort.std(axis=0))
-            theta = recording.position[part].mean(axis=0)
-            yield Observation(theta, mean_direction(down[part]), effort.mean(axis=0), friction, spread)

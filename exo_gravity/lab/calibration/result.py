@@ -5,8 +5,8 @@ The new file is a copy of the old one in which everything else stays as it is, c
 is replaced in the text, at the place that PyYAML's parser reports. A line above it says when it was measured, and how
 exactly. The copy is read again before it is kept: it must differ in the new values only.
 
-The page shows what friction makes of the torque that remains. An arm whose torque is wrong by less than the friction of
-a joint stays where it is. Beyond it creeps, until a viscous torque balances the rest.
+The page shows the torque that remains beside the friction. An arm whose torque is wrong by less than the friction of a
+joint stays where it is. Beyond it creeps, until a viscous torque balances the rest.
 """
 
 import datetime
@@ -38,7 +38,6 @@ DPI = 130
 FIGURE_WIDTH = 11.0  # inches
 ROW_HEIGHT, CURVE_HEIGHT = 2.5, 3.2  # inches, of a joint
 MOST_ACROSS = 4  # curves in a row
-SMALL_FRICTION = 0.2  # of the friction that was measured: a well-run-in gear
 
 Value = bool | int | float | str | list[int] | list[float] | list[str]
 
@@ -209,20 +208,10 @@ def _sections(result: CalibrationResult) -> Iterator[str]:
         line = "Predicted against measured torque: on the line, the file is right"
         caption = f"{line}. What remains in each pose: inside the band, friction holds the arm; outside, it creeps."
         yield html.picture(html.png_of(torque_figure(found, *of), DPI), caption)
-        yield html.bullets("Drift to expect", _drift(found, *remainders(found, *of)))
         yield html.bullets("What these poses do not show", unknown)
     if result.curves and result.arm:
         caption = "Friction over speed, half the difference between both directions."
         yield html.picture(html.png_of(friction_figure(result.curves, result.arm.joint_names), DPI), caption)
-
-
-def _drift(found: Identified, old: np.ndarray, _: np.ndarray, held_out: np.ndarray, used: np.ndarray) -> Iterator[str]:
-    """Yield in how many poses the arm creeps, with all of the measured friction and with little of it."""
-    wrong = np.abs((old, held_out))[:, used]
-    for share, friction in ((1.0, "the friction measured"), (SMALL_FRICTION, f"{SMALL_FRICTION:g} times that")):
-        before, after = np.any(wrong > share * found.friction, axis=2).sum(axis=1)
-        count = f"in {before} of {wrong.shape[1]} poses with the old file, in {after} with the new"
-        yield f"With {friction} the arm creeps {count}."
 
 
 def torque_figure(found: Identified, arm: ConfiguredArm, model: MomentModel, poses: Sequence[Observation]) -> Figure:

@@ -249,7 +249,7 @@ def tour_observations(
     request: what a person does first; they cannot reach a simulated device.
     """
     if options.bag:
-        return observations_of(options.bag, arm, model_of(arm), with_held="tour.friction" not in changes)
+        return observations_of(options.bag, arm, model_of(arm))
     nodes = tour_parameters(options.params, arm, changes)
     if request and f"{arm.namespace}/simulator" not in nodes:
         options.wait(request)
