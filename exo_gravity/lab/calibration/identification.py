@@ -566,27 +566,20 @@ def fit_friction(speed: np.ndarray, torque: np.ndarray, error: np.ndarray, carri
 
     Raises DataError for fewer than 3 speeds, or less than a factor of 2 between them.
     """
-    speeds, carried = len(np.unique(speed)), np.abs(carried)
-    if speeds < 3:
-        raise DataError(f"friction was measured at {speeds} speeds, must be at least 3")
-    if speed.max() < FRICTION.least_ratio * speed.min():
-        measured = f"from {speed.min():.2f} to {speed.max():.2f} rad/s"
-        raise DataError(
-            f"friction was measured {measured}, the fastest must be {FRICTION.least_ratio:g} times the slowest"
-        )
+    speeds, ratio, carried = len(np.unique(speed)), speed.max() / speed.min(), np.abs(carried)
+    if speeds < 3 or ratio < FRICTION.least_ratio:
+        measured = f"at {speeds} speeds, the fastest {ratio:.1f} times the slowest"
+        raise DataError(f"friction was measured {measured}: must be at least 3, and {FRICTION.least_ratio:g} times")
     falling = np.exp(-((speed / FRICTION.stribeck_speed) ** 2))
     matrix = np.stack((np.ones_like(speed), speed, falling, carried), axis=1)
-    used = np.array((True, True, speeds > 3, np.ptp(carried) > FRICTION.least_load))
+    matrix[:, 2:] *= speeds > 3, np.ptp(carried) > FRICTION.least_load
     noise = math.hypot(float(np.sqrt(np.mean(np.square(error)))), FRICTION.resolution)
-    while True:
-        values, errors = np.zeros(4), np.zeros(4)
-        inverse = np.linalg.pinv(matrix[:, used])
-        values[used] = inverse @ torque
-        scatter = np.linalg.norm(torque - matrix @ values) / math.sqrt(max(1, len(speed) - np.count_nonzero(used)))
-        errors[used] = max(noise, scatter) * np.linalg.norm(inverse, axis=1)
-        size = np.where(used, values / np.maximum(errors, 1e-12), np.inf)[2:]
-        if size.min() > FRICTION.asked:
-            coulomb, viscous, stribeck, load = values.tolist()
-            parts = (coulomb, viscous, stribeck, load, tuple(errors.tolist()))
-            return FrictionCurve(speed, torque, carried, matrix @ values, *parts)
-        used[2 + np.argmin(size)] = False
+    for _ in range(3):  # of a column of zeros the inverse gives 0
+        inverse = np.linalg.pinv(matrix)
+        values = inverse @ torque
+        freedom = max(1, len(speed) - np.linalg.matrix_rank(matrix))
+        scatter = np.linalg.norm(torque - matrix @ values) / math.sqrt(freedom)
+        errors = max(noise, scatter) * np.linalg.norm(inverse, axis=1)
+        matrix[:, 2:] *= values[2:] > FRICTION.asked * errors[2:]
+    fitted = matrix @ values
+    return FrictionCurve(speed, torque, carried, fitted, *values.tolist(), tuple(errors.tolist()))
