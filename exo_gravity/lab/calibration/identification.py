@@ -82,6 +82,7 @@ class Fit:
     #: brackets, over sqrt(6)
     axis: float = 0.0107
     pooling: float = 2.0  #: degrees of freedom with which all joints together inform the error of each
+    least_factor: float = 1e-4  #: of a variance, where poses agree by chance
     outlier: float = 10.0  #: standard errors off the other poses, beyond which a pose is left out
     #: Nm, and this share of the peak effort: a smaller error does no harm, nor does a hand cause it
     least_outlier: float = 0.05
@@ -274,7 +275,7 @@ def solve(rows: Rows, known: Known, effort: np.ndarray, spread: np.ndarray, pass
         held_out = sigma * np.linalg.solve(left, (residual / sigma)[..., None])[..., 0]
         freedom, squares = np.einsum("mjj->j", left), ((residual / spread) ** 2).sum(axis=0)
         common = FIT.pooling * squares.sum() / freedom.sum()
-        sigma = spread * np.sqrt((squares + common) / (freedom + FIT.pooling))
+        sigma = spread * np.sqrt(np.maximum((squares + common) / (freedom + FIT.pooling), FIT.least_factor))
     hidden = np.diag(covariance) > FIT.hidden * known.error**2
     # Student's distribution: for few poses two standard errors would cover less than 95 %.
     covariance *= (1.0 + 1.25 / (freedom.min() + 6.0)) ** 2

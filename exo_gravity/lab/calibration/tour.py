@@ -222,10 +222,10 @@ RAISED = 4  # chosen poses of a tour for friction: they show what depends on the
 STEADY_SPEED = 0.05  # rad/s of a sweep, from which on its friction is that of the motion between poses
 REFRESH_PERIOD = 0.1  # s between two estimates of the mass matrix, and of how uncertain the expected torque is
 # What stops a tour.
-MAX_ERROR = 0.12  # rad between a joint and the slow reference
+MAX_ERROR = 0.18  # rad between a joint and the slow reference
 FASTEST = 1.0  # rad/s of a joint; a light joint that leaves its friction reaches 0.5
 MAX_VIBRATING = 1.0  # s for which a motor may vibrate
-MAX_CORRECTION = 0.5  # Nm, of the controllers, in addition to what is unknown of weight and friction
+MAX_CORRECTION = 0.75  # Nm, of the controllers, in addition to what is unknown of weight and friction
 DEVIATIONS = 3.0  # of the expected torque
 UNKNOWN_FRICTION = 1.0  # Nm, until it is measured
 PERSISTENCE = 0.25  # s for which a torque must be unexplained

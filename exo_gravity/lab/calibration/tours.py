@@ -623,6 +623,10 @@ def wearer_from(
         Change(node, "model_error.wearer_torque", unsure.round(3).tolist(), "Nm, of the wearer's passive arm"),
         Change(node, "model_error.wearer", round(unseen, 3), "share that the wearer may have held"),
     ]
+    if "model_error.torque" not in arm.compensator:
+        assumed = list(for_joints(ModelError().torque, count, max))
+        note = "Nm of the robot, assumed: `calibrate gravity` measures it"
+        changes.append(Change(node, "model_error.torque", assumed, note))
     return CalibrationResult(tuple(changes), lines, tuple(refusals), arm, observations=tuple(observations))
 
 
