@@ -58,7 +58,6 @@ class CalibratorNode(ThreadedNode):
         self._began = False
         self._reported: dict[str, Any] = {"progress": "", "trouble": "", "done": False}  # printed last
         self._printed = 0  # observations
-        self._trouble = ""  # outside the tour
         self._diagnostics = Diagnostics(self)
         self._sources = {"joint_states": Publishers()}  # of what the torque depends on
         self._publisher = self.create_publisher(JointState, "effort_commands", 1)
@@ -84,10 +83,10 @@ class CalibratorNode(ThreadedNode):
         self._command.header.stamp = message.header.stamp
         try:
             self._sources["joint_states"].note(info)
-            self._trouble = second_publisher(self._sources) or self._trouble
+            self._tour.trouble = self._tour.trouble or second_publisher(self._sources)
             effort = self._effort(by_name(message, "position", self._names), by_name(message, "velocity", self._names))
         except ParameterError as error:
-            self._trouble, effort = f"joint_states: {error}", None
+            self._tour.trouble, effort = f"joint_states: {error}", None
         self._command.effort = effort or ()
         self._publisher.publish(self._command)
         if self._uses_imu:
@@ -100,8 +99,8 @@ class CalibratorNode(ThreadedNode):
             tilt, state = self._tilt.at(now), self._bridge_state
             problem = self._tilt.problem(now).text if self._uses_imu else ""
         if problem and self._began:
-            self._trouble = self._trouble or problem
-        if problem or self._trouble:
+            self._tour.trouble = self._tour.trouble or problem
+        if problem or self._tour.trouble:
             return None
         self._began = self._began or state == State.ACTIVE.value
         return self._tour.step(now, position, velocity, tilt) if self._began else self._tour.wait(position, tilt)
@@ -119,11 +118,11 @@ class CalibratorNode(ThreadedNode):
                 readings = [values.get(f"{name} temperature (degC)", UNKNOWN) for name in self._names]
                 self._tour.temperature = () if UNKNOWN in readings else tuple(map(float, readings))
                 has_left = self._began and not self._tour.done and state != State.ACTIVE.value
-                if (has_fault or has_left) and not self._trouble and not self._tour.trouble:
-                    self._trouble = status.message if has_fault else f"the bridge stopped carrying: {state}"
+                if (has_fault or has_left) and not self._tour.trouble:
+                    self._tour.trouble = status.message if has_fault else f"the bridge stopped carrying: {state}"
 
     def _report(self) -> None:
-        tour, trouble = self._tour, self._tour.trouble or self._trouble
+        tour, trouble = self._tour, self._tour.trouble
         lines = [line_of(one) for one in tour.measured[self._printed :]]
         self._printed += len(lines)
         progress = tour.progress if self._began else f"waiting for the arm to be carried: {self._bridge_message}"

@@ -583,4 +583,5 @@ def fit_friction(speed: np.ndarray, torque: np.ndarray, error: np.ndarray, carri
         errors = max(noise, scatter) * np.linalg.norm(inverse, axis=1)
         matrix[:, 2:] *= values[2:] > FRICTION.asked * errors[2:]
     fitted = matrix @ values
-    return FrictionCurve(speed, torque, carried, fitted, *values.tolist(), tuple(errors.tolist()))
+    coulomb, viscous, stribeck, load = values.tolist()
+    return FrictionCurve(speed, torque, carried, fitted, coulomb, viscous, stribeck, load, tuple(errors.tolist()))

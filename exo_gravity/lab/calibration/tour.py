@@ -233,10 +233,11 @@ SATURATION = 0.1  # s for which a joint may want more than its max_effort
 MAX_GAP = 0.1  # s between two joint states; as long as can_bridge's longest time-out
 LONGEST_CHOICE = 30.0  # s for which the arm is held while the next pose is chosen
 MAX_TILT = 0.1  # rad by which the stand or the trunk may tilt during the tour
-VIBRATES = (
-    "its motor vibrates: is something loose? Stiffen an elastic joint, correct the file's masses, or hang no weight"
+HAND = "a hand is on the arm, or the joint is blocked"
+VIBRATED = (
+    "motors vibrated, as behind elastic joints: correct the file's masses and torque_scale, hang no weight, or stiffen "
+    "the joint"
 )
-HAND = "a hand is on the arm, the joint is blocked, or it is elastic and needs stiffer parts or less weight"
 MAX_UNREST = (0.12, 0.25, 0.05)  # Nm, share of friction, share of the torque: between two passes of the same pose
 
 
@@ -307,6 +308,8 @@ class Tour:
             self._uncertain = self._acting.torques(np.array([position]), self.down)[1][0]
         effort = self._tracker.step(dt, position, velocity, expected, self.down, self._matrix)
         self.trouble = self.trouble or self._wrong_motion(dt, tilt) or self._wrong_torque(dt)
+        if self.trouble and self._tracker.is_softened:
+            self.trouble += f"; {VIBRATED}"
         return None if self.trouble else effort
 
     def _wrong_motion(self, dt: float, tilt: Tilt) -> str:
@@ -325,7 +328,7 @@ class Tour:
             if not abs(speed) <= FASTEST:
                 return f"{name}: {speed:.2f} rad/s, the limit is {FASTEST:g}: it slipped or was pushed"
             if vibrating > MAX_VIBRATING:
-                return f"{name}: {VIBRATES}"
+                return f"{name}: its motor goes on vibrating: is something loose?"
         return ""
 
     def _wrong_torque(self, dt: float) -> str:
@@ -359,10 +362,9 @@ class Tour:
             self.guess = TorqueGuess(self.guess.model, self._load, [*self._earlier, *self.measured])
             is_over = len(self._left_out) > MAX_LEFT_OUT
             self._plan = None if is_over else next(self._stations, None), ""
-        except ExoGravityError as error:
-            self._plan = (None, str(error))
         except Exception as error:
-            self._plan = (None, f"the next pose could not be chosen: {type(error).__name__}: {error}")
+            why = "" if isinstance(error, ExoGravityError) else f"{type(error).__name__}: "
+            self._plan = (None, f"the next pose could not be chosen: {why}{error}")
         self._awaits_plan = False
 
     def _lines(self) -> Iterator[Line]:
@@ -392,9 +394,9 @@ class Tour:
         """Yield each sweep until enough were good, and keep what they show; or leave the pose out if a joint sticks."""
         failures, sweeps = 0, list[Sweep]()
         while len(sweeps) < 2 * station.cycles:
-            frequency = self._tracker.frequency
+            frequency = self._tracker.frequency.min()
             pair = yield from self._tracker.sweep(station)
-            if self._tracker.frequency < frequency:  # neither friction nor gravity shows while motors vibrate
+            if self._tracker.frequency.min() < frequency:  # neither friction nor gravity shows while motors vibrate
                 sweeps = []
                 continue
             share, was_known = followed(pair, station), bool(np.any(self.friction))

@@ -56,7 +56,6 @@ from exo_gravity.lab.calibration.identification import (
     fit_friction,
     identify,
     known_of,
-    next_pose,
     rows_at,
     temperatures,
     torque_error,
@@ -65,7 +64,7 @@ from exo_gravity.lab.calibration.identification import (
 from exo_gravity.lab.calibration.moment_model import MOMENT_PARAMETERS, MomentModel
 from exo_gravity.lab.calibration.recorded import observations_of
 from exo_gravity.lab.calibration.result import CalibrationResult, Change
-from exo_gravity.lab.calibration.tour import BRIDGE, candidates, observations_in, of_arm
+from exo_gravity.lab.calibration.tour import BRIDGE, observations_in, of_arm
 from exo_gravity.lab.calibration.tracking import Observation
 from exo_gravity.lab.inputs.arms import ConfiguredArm
 from exo_gravity.lab.inputs.node_checks import check_start
@@ -305,10 +304,7 @@ def moments_from(
         for name, value in zip(arm.joint_names, scale, strict=True)
         if not low <= value <= high
     )
-    poses, taken = candidates(arm.limits, model), [one.theta for one in observations]
-    best = poses[next_pose(taken, poses, observations[-1].direction, model.moments, model)]
-    more = f"next best pose, if more is wanted: {' '.join(f'{angle:.0f}' for angle in np.degrees(best))} degrees"
-    changes, lines = tuple(_changes(arm, model, found, scale)), (*_lines(arm, found), more)
+    changes, lines = tuple(_changes(arm, model, found, scale)), tuple(_lines(arm, found))
     return CalibrationResult(changes, lines, impossible, arm, model, tuple(observations), found)
 
 

@@ -11,7 +11,7 @@ frequency that it is given, however they are coupled.
 Behind an elastic joint the links no longer hold the rotor: above their resonance the controller moves the rotor alone,
 which has 1 to 20 % of the inertia that the gains are for. An AK60-6 on 1,000 Nm/rad rings at 170 Hz, beyond what 250 Hz
 sample. So the gains are low, and pass a low-pass filter which leaves nothing of them at the rotor's frequencies. Where
-a motor vibrates all the same, they become lower for all.
+a motor vibrates all the same, its own become lower.
 """
 
 import math
@@ -48,8 +48,9 @@ class TrackerTuning:
     #: natural frequency in rad/s per control cycle per s; two cycles of delay cost 27 degrees
     frequency_per_rate: float = 0.12
     max_frequency: float = 8.0  #: rad/s
-    calm: float = 0.3  #: s for which a motor may vibrate, before all gains become
-    softer: float = 0.6  #: of this frequency
+    calm: float = 0.6  #: s for which a motor may vibrate, before its frequency becomes
+    softer: float = 0.7  #: of what it was
+    slowest: float = 0.1  #: rad/s: the speed falls to it with the frequency, as the integral part is slower, too
     least_frequency: float = 2.5  #: rad/s: 0.6 kg m^2 on 150 Nm/rad oscillate with 5, at 10 Hz (measured)
     #: times the frequency, where the low-pass filter of the gains begins: three of them in a row cost 35 degrees where
     #: the gain is 1, and leave 3 % of it at twice the frequency that the filter begins with
@@ -209,8 +210,9 @@ class Tracker:
     saturated: (n,) s for which each joint has wanted more than its `max_effort`.
     error: (n,) rad by which the arm is behind its path.
     correction: (n,) Nm, what the controller added to gravity and friction in the last step.
-    frequency: rad/s, of each joint under the present gains.
+    frequency: (n,) rad/s, of each joint under the present gains.
     vibration: of the motors. vibrating: (n,) s for which each joint's motor has vibrated under these gains.
+    is_softened: whether gains were lowered because a motor vibrated.
     """
 
     def __init__(self, rate: float, max_effort: Sequence[float]) -> None:
@@ -220,8 +222,9 @@ class Tracker:
         self.error = np.zeros(count)
         self.correction = np.zeros(count)
         self.vibrating = np.zeros(count)
+        self.is_softened = False
         self.vibration = Vibration(count)
-        self.frequency = min(TRACKER.max_frequency, TRACKER.frequency_per_rate * rate)
+        self.frequency = np.full(count, min(TRACKER.max_frequency, TRACKER.frequency_per_rate * rate))
         self._filter = np.zeros((TRACKER.filter_order, count))  # Nm, what each filter passes
         self._max_effort = np.array(max_effort)
         self._integral = np.zeros(count)
@@ -261,6 +264,8 @@ class Tracker:
         # The path does not wait for a joint that is ahead: it would not come back against its friction.
         behind = float(np.where(self._line.way, self.error * self._line.way, np.abs(self.error)).max())
         pace = max(0.0, min(1.0, (TRACKER.stop_error - behind) / (TRACKER.stop_error - TRACKER.slow_error)))
+        fastest = max(TRACKER.slowest, MOTION.speed * float(self.frequency.min()) / TRACKER.max_frequency)
+        pace = min(pace, fastest / self._line.speed) if self._line.duration else pace
         self._time += pace * dt
         if self._samples is not None and self._line.is_measured(self._time):
             # The effort of the last cycle brought the arm here.
@@ -269,8 +274,10 @@ class Tracker:
         coming = self._line.at(self._time + MOTION.lead)[1] if self._time < MOTION.lead else heading
         speed_error = pace * heading - velocity
         self.vibrating = np.where(self.vibration.step(dt, velocity), self.vibrating + dt, 0.0)
-        if np.any(self.vibrating > TRACKER.calm) and self.frequency > TRACKER.least_frequency:
-            self.frequency, self.vibrating = TRACKER.softer * self.frequency, 0.0 * self.vibrating
+        too_stiff = (self.vibrating > TRACKER.calm) & (self.frequency > TRACKER.least_frequency)
+        self.frequency = np.where(too_stiff, TRACKER.softer, 1.0) * self.frequency
+        self.vibrating[too_stiff] = 0.0
+        self.is_softened |= bool(np.any(too_stiff))
         self._compensate_friction(dt, coming, speed_error)
         self._effort = self._controlled(dt, speed_error, expected, matrix + TRACKER.added * np.eye(len(matrix)))
         return self._effort
@@ -285,8 +292,8 @@ class Tracker:
 
     def _controlled(self, dt: float, speed_error: np.ndarray, expected: Torque, matrix: np.ndarray) -> Torque:
         frequency, weakest = self.frequency, float(np.linalg.eigvals(matrix).real.min())
-        stiff = frequency**2 * (matrix @ self.error)
-        push = self._filtered(dt, stiff + 2.0 * frequency * (matrix @ speed_error))
+        root, stiff = np.sqrt(frequency), frequency * (matrix @ (frequency * self.error))
+        push = self._filtered(dt, stiff + 2.0 * root * (matrix @ (root * speed_error)))
         floor = TRACKER.floor * weakest * self.error * frequency**2
         integral = self._integral + TRACKER.integral_share * frequency * dt * (stiff + floor)
         torque = expected + self._slide + push + integral
@@ -299,7 +306,7 @@ class Tracker:
 
     def _filtered(self, dt: float, push: np.ndarray) -> np.ndarray:
         """Return `push` (n,) Nm without what a rotor could vibrate with."""
-        passed = 1.0 - math.exp(-TRACKER.filtered_from * self.frequency * dt)
+        passed = 1.0 - np.exp(-TRACKER.filtered_from * self.frequency * dt)
         for stage in self._filter:
             stage += passed * (push - stage)
             push = stage
