@@ -19,7 +19,6 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import yaml
-from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from exo_gravity.core.compensation.settings import joint_spring_of
@@ -36,8 +35,7 @@ PARAMETERS = "ros__parameters"
 WIDTH = 118  # characters of a comment line
 DPI = 130
 FIGURE_WIDTH = 11.0  # inches
-ROW_HEIGHT, CURVE_HEIGHT = 2.5, 3.2  # inches, of a joint
-MOST_ACROSS = 4  # curves in a row
+ROW_HEIGHT, CURVE_HEIGHT = 2.5, 4.0  # inches, of a joint's remainders, of all curves
 
 Value = bool | int | float | str | list[int] | list[float] | list[str]
 
@@ -169,20 +167,18 @@ def _comment(indent: str, note: str) -> str:
 
 def remainders(
     found: Identified, arm: ConfiguredArm, model: MomentModel, poses: Sequence[Observation]
-) -> tuple[np.ndarray, ...]:
-    """Return measured minus predicted torque (m, n) in Nm as commanded, and which of the poses (m,) were used.
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return measured minus predicted torque (m, n) in Nm as commanded, of the old file and of the new one.
 
-    Predicted by the old file; by the new one, which lacks the offsets of joints without a spring; and by a result that
-    was found without that pose.
+    The new file lacks the offsets of joints without a spring. Its remainders are those of a result that was found
+    without that pose.
     """
     theta, direction, measured, _ = columns(poses)
     loads = np.array([model.load(pose.load_mass, pose.load_lever) for pose in poses])
     rows = model.rows(theta, direction)
     springs = joint_spring_of(arm.compensator).torques(theta)
     old = measured - np.einsum("njk,nk->nj", rows, model.moments + loads) - springs
-    used = ~np.isin(np.arange(len(poses)), list(found.rejected))
-    lacking = found.value.offset * (found.value.spring == 0.0)
-    return old, found.residual + lacking, found.held_out + lacking, used
+    return old, found.held_out + found.value.offset * (found.value.spring == 0.0)
 
 
 def page_of(result: CalibrationResult, command: str, params: str, today: datetime.date | None = None) -> str:
@@ -205,8 +201,7 @@ def _sections(result: CalibrationResult) -> Iterator[str]:
         yield html.table(("node", "parameter", "value", "note"), [((), rows)])
     if found and result.arm and result.model:
         of = result.arm, result.model, result.observations
-        line = "Predicted against measured torque: on the line, the file is right"
-        caption = f"{line}. What remains in each pose: inside the band, friction holds the arm; outside, it creeps."
+        caption = "Measured less predicted torque: inside the band, friction holds the arm; outside, it creeps."
         yield html.picture(html.png_of(torque_figure(found, *of), DPI), caption)
         yield html.bullets("What these poses do not show", unknown)
     if result.curves and result.arm:
@@ -215,60 +210,43 @@ def _sections(result: CalibrationResult) -> Iterator[str]:
 
 
 def torque_figure(found: Identified, arm: ConfiguredArm, model: MomentModel, poses: Sequence[Observation]) -> Figure:
-    """Return a row per joint: predicted against measured torque, and what remains in each pose, with the friction."""
-    count, colours = len(arm.joint_names), joint_colours(len(arm.joint_names))
+    """Return a row per joint: what remains of the measured torque in each pose, with the friction."""
+    count, numbers = len(arm.joint_names), np.arange(1, len(poses) + 1)
     figure = Figure(figsize=(FIGURE_WIDTH, ROW_HEIGHT * count), layout="constrained")
-    theta, _, effort, spread = columns(poses)
-    *remaining, used = remainders(found, arm, model, poses)
-    numbers = np.arange(1, len(poses) + 1)
-    for joint, (left, right) in enumerate(figure.subplots(count, 2, width_ratios=(1.0, 3.0), squeeze=False)):
-        colour, friction = colours[joint], found.friction[joint]
-        measured, old, new, held_out = (column[:, joint] for column in (effort, *remaining))
-        left.axline((0.0, 0.0), slope=1.0, color=FAINT, lw=0.8, zorder=0)
-        left.plot(measured, measured - old, "o", ms=4.5, mfc="none", color=INK)
-        left.plot(measured[used], (measured - new)[used], "o", ms=4.5, color=colour)
-        left.plot(measured[~used], (measured - new)[~used], "x", ms=6, color=INK)
-        left.set(aspect="equal", adjustable="datalim", ylabel="Predicted (Nm)")
-        right.axhspan(-friction, friction, color=HOLD_COLOUR, lw=0, zorder=0, label="friction holds")
-        right.axhline(0.0, color=FAINT, lw=0.6, zorder=0)
-        right.plot(numbers[used] - 0.12, old[used], "o", ms=5, mfc="none", color=INK, label="old file")
-        right.errorbar(
-            numbers[used] + 0.12, held_out[used], 2.0 * spread[used, joint], fmt="o", ms=4.5, lw=1.2, color=colour,
-            label="new file; right: this pose held out, ± 2 standard errors",
+    theta, _, _, spread = columns(poses)
+    old, new = remainders(found, arm, model, poses)
+    used = ~np.isin(numbers - 1, list(found.rejected))
+    axes, colours = figure.subplots(count, 1, squeeze=False)[:, 0], joint_colours(count)
+    for joint, (axis, colour, name) in enumerate(zip(axes, colours, arm.joint_names, strict=True)):
+        friction = found.friction[joint]
+        axis.axhspan(-friction, friction, color=HOLD_COLOUR, lw=0, zorder=0, label="friction holds")
+        axis.axhline(0.0, color=FAINT, lw=0.6, zorder=0)
+        axis.plot(numbers[used] - 0.12, old[used, joint], "o", ms=5, mfc="none", color=INK, label="old file")
+        axis.errorbar(
+            numbers[used] + 0.12, new[used, joint], 2.0 * spread[used, joint], fmt="o", ms=4.5, lw=1.2, color=colour,
+            label="new file, this pose held out, ± 2 standard errors",
         )  # fmt: skip
-        right.set(xlim=(0.4, len(numbers) + 0.6), ylabel="Remainder (Nm)")
-        right.set_xticks(numbers, [])
-        _finish(left, colour, arm.joint_names[joint])
-        _finish(right, colour)
-    left.set_xlabel("Measured (Nm)")
+        axis.set(xlim=(0.4, len(numbers) + 0.6), ylabel="Remainder (Nm)")
+        axis.set_xticks(numbers, [])
+        axis.set_title(name, fontsize=10, color=colour, loc="left", weight="bold")
+        make_plain(axis)
     rows = [[str(n), *(f"{angle:.0f}" for angle in pose)] for n, pose in zip(numbers, np.degrees(theta), strict=True)]
     ticks = ["\n".join(row if kept else [*row, "left out"]) for row, kept in zip(rows, used, strict=True)]
-    right.set_xticks(numbers, ticks, fontsize=8)
-    right.set_xlabel("Pose, with its angles in degrees")
-    figure.legend(*right.get_legend_handles_labels(), loc="outside upper center", ncols=3, frameon=False, fontsize=9)
+    axis.set_xticks(numbers, ticks, fontsize=8)
+    axis.set_xlabel("Pose, with its angles in degrees")
+    figure.legend(*axis.get_legend_handles_labels(), loc="outside upper center", ncols=3, frameon=False, fontsize=9)
     return figure
 
 
 def friction_figure(curves: Sequence[FrictionCurve], labels: Sequence[str]) -> Figure:
-    """Return the friction of each joint over its speed, measured and fitted, less what grows with the torque."""
-    down, colours = math.ceil(len(curves) / MOST_ACROSS), joint_colours(len(curves))
-    figure = Figure(figsize=(FIGURE_WIDTH, CURVE_HEIGHT * down), layout="constrained")
-    axes = figure.subplots(down, MOST_ACROSS, sharey=True, squeeze=False).ravel()
-    for unused in axes[len(curves) :]:
-        unused.remove()
-    for joint, axis in enumerate(axes[: len(curves)]):
-        curve, order = curves[joint], np.argsort(curves[joint].speed)
-        of_load = curve.load * curve.carried
-        axis.plot(curve.speed, curve.torque - of_load, "o", ms=4.5, color=colours[joint], label="measured")
-        axis.plot(curve.speed[order], (curve.fitted - of_load)[order], color=INK, lw=1.0, label="fitted")
-        axis.set_xlabel("Speed (rad/s)")
-        axis.legend(frameon=False, fontsize=8)
-        _finish(axis, colours[joint], labels[joint])
-    figure.axes[0].set(ylabel="Friction (Nm)", ylim=(0.0, None))
-    return figure
-
-
-def _finish(axis: Axes, colour: str, title: str = "") -> None:
-    axis.set_title(title, fontsize=10, color=colour, loc="left", weight="bold")
+    """Return the friction of all joints over their speed, measured and fitted, less what grows with the torque."""
+    figure = Figure(figsize=(FIGURE_WIDTH, CURVE_HEIGHT), layout="constrained")
+    axis = figure.subplots()
+    for curve, label, colour in zip(curves, labels, joint_colours(len(curves)), strict=True):
+        order, of_load = np.argsort(curve.speed), curve.load * curve.carried
+        axis.plot(curve.speed, curve.torque - of_load, "o", ms=4.5, color=colour)
+        axis.plot(curve.speed[order], (curve.fitted - of_load)[order], color=colour, lw=1.0, label=label)
+    axis.set(xlabel="Speed (rad/s)", ylabel="Friction (Nm)", ylim=(0.0, None))
+    axis.legend(frameon=False, fontsize=8)
     make_plain(axis)
-    axis.margins(y=0.12)
+    return figure

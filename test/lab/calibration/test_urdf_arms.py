@@ -144,7 +144,7 @@ class Bench:
         """The file that these observations give."""
         result, output = moments_from(self.arm, observations), self.params.with_name("new.yaml")
         assert result.refusals == ()
-        assert "Predicted against measured torque" in page_of(result, "gravity", str(self.params))
+        assert "Measured less predicted torque" in page_of(result, "gravity", str(self.params))
         write_changes(self.params, output, result.changes, "calibrate gravity")
         return output
 
