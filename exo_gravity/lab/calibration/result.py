@@ -23,7 +23,7 @@ from matplotlib.figure import Figure
 
 from exo_gravity.core.compensation.settings import joint_spring_of
 from exo_gravity.core.errors import ParameterError
-from exo_gravity.lab.calibration.identification import FrictionCurve, Identified, columns
+from exo_gravity.lab.calibration.identification import FrictionCurve, Identified, columns, held_offset
 from exo_gravity.lab.calibration.moment_model import MomentModel
 from exo_gravity.lab.calibration.tracking import Observation
 from exo_gravity.lab.inputs.arms import ConfiguredArm
@@ -170,7 +170,7 @@ def remainders(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return measured minus predicted torque (m, n) in Nm as commanded, of the old file and of the new one.
 
-    The new file lacks the offsets of joints without a spring. Its remainders are those of a result that was found
+    The new file lacks the part of an offset that no spring has. Its remainders are those of a result that was found
     without that pose.
     """
     theta, direction, measured, _ = columns(poses)
@@ -178,7 +178,7 @@ def remainders(
     rows = model.rows(theta, direction)
     springs = joint_spring_of(arm.compensator).torques(theta)
     old = measured - np.einsum("njk,nk->nj", rows, model.moments + loads) - springs
-    return old, found.held_out + found.value.offset * (found.value.spring == 0.0)
+    return old, found.held_out + found.value.offset - held_offset(found.value, found.value.scale)
 
 
 def page_of(result: CalibrationResult, command: str, params: str, today: datetime.date | None = None) -> str:

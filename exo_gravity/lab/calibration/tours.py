@@ -57,9 +57,9 @@ from exo_gravity.lab.calibration.identification import (
     identify,
     known_of,
     rows_at,
+    solve,
     temperatures,
     torque_error,
-    with_springs,
 )
 from exo_gravity.lab.calibration.moment_model import MOMENT_PARAMETERS, MomentModel
 from exo_gravity.lab.calibration.recorded import observations_of
@@ -373,11 +373,9 @@ def exact_law(arm: ConfiguredArm) -> Iterator[Change]:
 def _spring_changes(arm: ConfiguredArm, found: Identified) -> Iterator[Change]:
     """Yield the device's own springs, and the torque that they may add beyond gravity, where the file states one."""
     node, before, value = f"{arm.namespace}/compensator", joint_spring_of(arm.compensator), found.value
-    if not (np.any(value.spring) or before.on):
-        return
-    slack = value.turn[:, 0] - value.offset * value.scale / np.where(value.spring > 0.0, value.spring, np.inf)
+    slack = value.turn[:, 0] - value.offset * value.scale / np.maximum(value.spring, EXACT)
     new = Springs(value.spring.round(4).tolist(), np.clip(slack, -MAX_REST, MAX_REST).round(4).tolist())
-    note = f"Nm/rad, +-{row(found.error.spring)}; 0: the poses show none"
+    note = f"Nm/rad, +-{row(found.error.spring)}"
     yield Change(node, "joint_spring.stiffness", list(new.stiffness), note)
     yield Change(node, "joint_spring.rest", list(new.rest), "rad, with the offset of the motor")
     bridge = arm.can_bridge
@@ -488,6 +486,7 @@ class WearerPrior:
     moment: float = 0.03  #: kg m, in addition: 1.5 kg that lie 2 cm beside their link
     stiffness: float = 1.5  #: Nm/rad, of a relaxed shoulder or elbow
     middle: float = 1.0  #: Nm, of its torque in the middle of the poses
+    asked: float = 2.2  #: standard errors beyond which a spring is one; its square is ln of 120 efforts
     breathing: float = 0.1  #: Nm: standard deviation by which a relaxed, breathing person differs from pose to pose
     body_mass: float = 70.0  #: kg, where the file has none
     judged: float = 0.2  #: of the largest torque by the table, from which a joint's is compared with it
@@ -569,7 +568,11 @@ def wearer_from(
     middle, spread = (theta.min(axis=0) + theta.max(axis=0)) / 2.0, np.hypot(spread, PRIOR.breathing)
     rows = rows_at(model, theta, direction)._replace(theta=theta - middle)
     own = joint_spring_of(arm.compensator)
-    solution = with_springs(rows, worn.known, effort - own.torques(theta), spread, EXACT)
+    seen, before = effort - own.torques(theta), Unknowns.of(worn.known.error, model)
+    first = solve(rows, worn.known, seen, spread)
+    absent = Unknowns.of(first.unknowns / first.error, model).spring < PRIOR.asked
+    before.spring[absent] = before.offset[absent] = EXACT
+    solution = solve(rows, worn.known, seen, spread)
     changes_between = [np.ptp(solution.residual[list(pair)], axis=0) for pair in visits]
     change = np.max([np.zeros(count), *changes_between], axis=0)
     restless = [
