@@ -18,7 +18,7 @@ from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from exo_gravity.core.compensation.guidance import CAUSE_TIME
+from exo_gravity.core.compensation.load_change import CAUSE_TIME
 from exo_gravity.core.compensation.settings import COMPENSATOR, URDF, WORN_MOMENTS
 from exo_gravity.core.errors import ExoGravityError, ParameterError
 from exo_gravity.core.params import Param

@@ -18,7 +18,7 @@ from exo_gravity.core.arm.chain import least_inertia
 from exo_gravity.core.arm.interface import Payload
 from exo_gravity.core.arm.paper import mobile_torque, static_torque
 from exo_gravity.core.arm.wearer import Wearer
-from exo_gravity.core.compensation.guidance import DropWatch
+from exo_gravity.core.compensation.load_change import DropWatch
 from exo_gravity.lab.inputs.references import OFFSET, gravload, pinocchio, pinocchio_model
 from exo_gravity.sim import ArmConfig, SimulatedArm
 from exo_gravity.sim.arm import DEFAULT_LINKS, in_base

@@ -15,7 +15,7 @@ from exo_gravity.core.arm.springs import Springs
 from exo_gravity.core.arm.tilt import Tilt
 from exo_gravity.core.arm.wearer import TISSUE_REACH, Wearer
 from exo_gravity.core.compensation.compensator import Compensator
-from exo_gravity.core.compensation.guidance import TOUCH, CommandFade, GuidedChange, TouchWatch
+from exo_gravity.core.compensation.load_change import TOUCH, CommandFade, GuidedChange, TouchWatch
 from exo_gravity.core.compensation.support import NAME, REQUEST
 from exo_gravity.core.compensation.terms.catalogue import Spring
 from exo_gravity.core.compensation.terms.terms import TermSettings

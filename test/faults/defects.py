@@ -29,7 +29,7 @@ MONITOR, MOTION = "core.safety.explain:MotionMonitor.step", "core.safety.explain
 WALL = "core.safety.shape:JointShaper._wall"
 LEASE = "core.safety.lease:Lease.lost"
 COMPENSATOR = "core.compensation.compensator:Compensator.step"
-GUIDANCE = "core.compensation.guidance:GuidedChange.follow"
+GUIDANCE = "core.compensation.load_change:GuidedChange.follow"
 ASSIST_VALID, ASSIST = (f"core.compensation.terms.assist:AssistInput.{name}" for name in ("valid", "torque"))
 
 

@@ -30,11 +30,11 @@ from std_srvs.srv import Trigger
 from exo_gravity.core import gravity_torque
 from exo_gravity.core.arm.tilt import Tilt
 from exo_gravity.core.arm.wearer import Wearer
-from exo_gravity.core.compensation import guidance
+from exo_gravity.core.compensation import load_change
 from exo_gravity.core.compensation.compensator import Compensator
 from exo_gravity.core.compensation.settings import COMPENSATOR
 from exo_gravity.core.errors import ParameterError
-from exo_gravity.core.safety import guidance as guided
+from exo_gravity.core.safety import guidance
 from exo_gravity.hardware.network import restrict_to_localhost
 from exo_gravity.hardware.urdf_arm import UrdfArm
 from exo_gravity.lab.inputs.arms import read_arm
@@ -169,8 +169,8 @@ class CompensatorRig(NodeRig):
 @pytest.fixture
 def make_rig(monkeypatch) -> Iterator[Callable[..., CompensatorRig]]:
     """A function that makes a rig, with shorter ramps and fades, which test_compensator.py times."""
-    monkeypatch.setattr(guided, "GUIDANCE", replace(guided.GUIDANCE, time=0.2, rate=100.0))
-    monkeypatch.setattr(guidance, "LAST_FADE", 0.4)
+    monkeypatch.setattr(guidance, "GUIDANCE", replace(guidance.GUIDANCE, time=0.2, rate=100.0))
+    monkeypatch.setattr(load_change, "LAST_FADE", 0.4)
     yield from each_closed(CompensatorRig)
 
 

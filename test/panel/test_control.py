@@ -19,7 +19,7 @@ import yaml
 
 import exo_gravity.panel
 from exo_gravity.core import vocabulary
-from exo_gravity.core.compensation.guidance import CAUSE_TIME
+from exo_gravity.core.compensation.load_change import CAUSE_TIME
 from exo_gravity.core.errors import ParameterError
 from exo_gravity.core.safety.command import FaultCode, State
 from exo_gravity.core.safety.lease import LEASE_TIME

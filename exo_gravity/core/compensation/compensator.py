@@ -18,7 +18,7 @@ import numpy as np
 
 from exo_gravity.core.arm.interface import MAX_PAYLOAD, STANDARD_GRAVITY
 from exo_gravity.core.arm.tilt import AXES, Tilt
-from exo_gravity.core.compensation.guidance import DROP, PAUSE, TOUCH, DropWatch, GuidedChange, TouchWatch
+from exo_gravity.core.compensation.load_change import DROP, PAUSE, TOUCH, DropWatch, GuidedChange, TouchWatch
 from exo_gravity.core.compensation.settings import Settings
 from exo_gravity.core.compensation.support import SupportRequest
 from exo_gravity.core.compensation.terms.terms import Terms, TermsInForce

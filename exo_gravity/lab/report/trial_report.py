@@ -21,7 +21,7 @@ import numpy as np
 from rich.console import Console
 from rich.markup import escape as marked
 
-from exo_gravity.core.compensation.guidance import CAUSE_TIME
+from exo_gravity.core.compensation.load_change import CAUSE_TIME
 from exo_gravity.core.errors import DataError, ParameterError
 from exo_gravity.core.safety.command import FaultCode
 from exo_gravity.core.safety.limits import limits_of

@@ -18,8 +18,8 @@ from std_srvs.srv import Trigger
 from exo_gravity.core.arm.tilt import SIDES
 from exo_gravity.core.compensation import settings
 from exo_gravity.core.compensation.compensator import Compensation, Compensator
-from exo_gravity.core.compensation.guidance import CommandFade
 from exo_gravity.core.compensation.laws import GROUP
+from exo_gravity.core.compensation.load_change import CommandFade
 from exo_gravity.core.compensation.settings import Settings
 from exo_gravity.core.errors import ParameterError
 from exo_gravity.core.params import Param, installed

@@ -15,7 +15,7 @@ from functools import partial
 from typing import Any, NamedTuple
 
 from exo_gravity.core.arm.interface import Arm
-from exo_gravity.core.compensation.guidance import PAUSE
+from exo_gravity.core.compensation.load_change import PAUSE
 from exo_gravity.core.compensation.terms.assist import Assist, AssistInput
 from exo_gravity.core.compensation.terms.catalogue import (
     DELAY,
@@ -155,7 +155,7 @@ class Terms:
         return self._refusal or refused
 
     def apply(self, settings: TermSettings, arm: Arm) -> None:
-        """Use new settings and a new arm at once: it is for the caller to guide the change (`guidance`)."""
+        """Use new settings and a new arm at once: it is for the caller to guide the change (`load_change`)."""
         since = self.in_force.since if settings.spring == self.settings.spring else self._time
         self.settings, self.assist.assist = settings, settings.assist
         self.in_force = TermsInForce(self._built(settings, arm), since)
