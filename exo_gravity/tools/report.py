@@ -19,7 +19,7 @@ from pathlib import Path
 
 from exo_gravity.core.errors import ParameterError
 from exo_gravity.core.vocabulary import Source
-from exo_gravity.lab.bag.content import Bag
+from exo_gravity.lab.bag.content import Bag, name_of
 from exo_gravity.lab.report import html, video
 from exo_gravity.lab.trial.analysis import MIN_HOLD, HoldCriteria
 from exo_gravity.lab.vocabulary import of_all
@@ -92,7 +92,7 @@ def _run(options: argparse.Namespace) -> int:
     given = {name: value for name in ("width", "font") if (value := getattr(options, name))}
     on_paper = html.Print(options.figures, **given)
     (path, *more), screen = options.bag, Console(stderr=True)
-    beside = path.resolve().with_name(f"{path.resolve().stem}_report")
+    beside = path.resolve().with_name(f"{name_of(path.resolve())}_report")
     if more or options.scheduler or (path.is_dir() and cohort.recordings_below(path) not in ([], [path])):
         return _run_cohort(options, criteria, on_paper, Path(options.output or beside))
     clip = video.requested(options.video, options.video_speed)
@@ -164,7 +164,7 @@ def _run_cohort(options: argparse.Namespace, criteria: HoldCriteria, on_paper: h
     source = of_all(Source(row["source"]) for row in trials if row["verdict"])
     figure = study.figure(trials, keys)
     png = html.saved(figure, output / "cohort.png", STAMPS[source], on_paper) if figure else b""
-    name = options.bag[0].resolve().stem if len(options.bag) == 1 else f"{len(recordings)} recordings"
+    name = name_of(options.bag[0].resolve()) if len(options.bag) == 1 else f"{len(recordings)} recordings"
     (output / "cohort.html").write_text(study.page(trials, name, tables, png), encoding="utf-8")
     console = Console(highlight=False, width=None if Console().is_terminal else 200)
     study.print_trials(trials, tables, console)

@@ -40,14 +40,15 @@ node.TIMING = replace(node.TIMING, silence=3.0)
 node.TYPES["grip_force"] = Float64
 node.main()
 """
-NODE = [sys.executable, "-c", PROGRAM, "--ros-args"]
+# The IMU is renamed, as by `launcher --namespace lab`.
+NODE = [sys.executable, "-c", PROGRAM, "--ros-args", "-r", "/imu/data_raw:=/lab/imu/data_raw"]
 NAMES = ["j1", "j2", "j3", "j4"]
 COUNT = 300
 STEP = 1e-4  # rad by which each message's angles are larger than those of the one before
 FIELDS = (("/right/joint_states", "position", STEP), ("/right/effort_commands", "effort", 1.0))
 MESSAGES = {
     **dict.fromkeys(("joint_states", "effort_commands", "assist_efforts"), (JointState, 1)),
-    "/imu/data_raw": (Imu, qos_profile_sensor_data),
+    "/lab/imu/data_raw": (Imu, qos_profile_sensor_data),
     "/diagnostics": (DiagnosticArray, 10),
     "wearer_step": (String, LATCHED),
     "/event_marker": (String, 10),

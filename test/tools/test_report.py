@@ -60,7 +60,7 @@ def folder(held, tmp_path_factory):
 def short_bag(tmp_path_factory):
     """A bag of two holds with some drift in the elbow, 6 degrees per minute."""
     recording = made.trial(made.POSES, hold=4.0, rate=100.0, drift=AWAY)
-    return made.write_bag(tmp_path_factory.mktemp("bags") / "short", made.messages(recording))
+    return made.write_bag(tmp_path_factory.mktemp("bags") / "short_1.2", made.messages(recording))
 
 
 AWAY = np.array([0.0, 0.0, 0.0, math.radians(6.0) / 60.0])  # rad/s
@@ -142,10 +142,10 @@ def test_the_report_is_written_next_to_its_recording_and_on_request_time_series_
     short_bag, tmp_path, monkeypatch, run_tool
 ):
     assert run_tool("report", short_bag).code == 0
-    assert {path.name for path in short_bag.with_name("short_report").iterdir()} == {
+    assert {path.name for path in short_bag.with_name("short_1.2_report").iterdir()} == {
         *("holds.csv", "motions.csv", "report.html", "report.json", "right_drift.png", "right_overview.png")
     }
-    beside = short_bag.with_name("short_report")
+    beside = short_bag.with_name("short_1.2_report")
     assert run_tool("report", short_bag, "--min-hold", "99").code == 1 and "never still" in page_in(beside).text
     assert {path.name for path in beside.iterdir()} == {"report.html", "report.json", "right_overview.png"}  # no others
     nowhere = run_tool("report", short_bag, "--output", short_bag / "metadata.yaml" / "report")

@@ -80,6 +80,11 @@ READ = {  # type of each topic, or last part of its name, that the reader decode
 }
 
 
+def name_of(path: Path) -> str:
+    """Return the name of a recording: that of its folder, or of its file without the end."""
+    return path.name if path.is_dir() else path.stem
+
+
 def leaf(topic: str) -> str:
     """Return the last part of a topic's name."""
     return topic.rpartition("/")[2]
@@ -134,7 +139,7 @@ class Bag:
     def trial(self) -> str:
         """The name of the trial's folder: `trial` records into NAME_DATE_TIME/bag."""
         path = self.path.resolve()
-        return path.parent.name if path.stem == "bag" else path.stem
+        return path.parent.name if name_of(path) == "bag" else name_of(path)
 
     def source(self, arm: str) -> Source:
         """Return whether `arm` was simulated: as its nodes say, else by their parameters."""

@@ -86,6 +86,8 @@ class Recorder(Node):
         self._last_states, self._orphaned = -math.inf, math.inf  # monotonic s
         self._losses = ""  # what was reported of them
         self._topics: dict[str, PolledSubscription] = {}
+        # `launcher --namespace` renames these for every node: the recording has them by the names that tools know
+        self._names = {self.resolve_topic_name(name): name for name in TYPES if name.startswith("/")}
         self._counted: list[Publishers] = []  # of joints and IMU; other topics have several
         self._taken: list[tuple[str, int, bytes]] = []  # topic, time of arrival in ns since 1970, serialised
         self._nodes = OtherNodes(self, on_read=partial(self._guarded, "parameters", self._write_parameters), once=True)
@@ -129,9 +131,10 @@ class Recorder(Node):
     def _discover(self) -> None:
         """Subscribe to new topics."""
         for topic, _types in self.get_topic_names_and_types():
-            msgtype = TYPES.get(topic) or TYPES.get(leaf(topic))
+            name = self._names.get(topic, topic)
+            msgtype = TYPES.get(name) or TYPES.get(leaf(name))
             if msgtype and topic not in self._topics:
-                self._guarded(topic, self._subscribe, topic, msgtype)
+                self._guarded(topic, self._subscribe, topic, name, msgtype)
 
     def _update_live(self) -> None:
         """Ask new nodes for their parameters, and print the live line."""
@@ -159,7 +162,8 @@ class Recorder(Node):
             self._losses = losses
             self.get_logger().warning(f"messages lost so far: {losses}")
 
-    def _subscribe(self, topic: str, msgtype: type) -> None:
+    def _subscribe(self, topic: str, name: str, msgtype: type) -> None:
+        """Subscribe to a topic, which has that name in the recording."""
         found = self.get_publishers_info_by_topic(topic)
         named = [publisher for publisher in found if publisher.node_name not in (REPEATER, UNNAMED)]
         typed = [publisher for publisher in named if leaf(publisher.topic_type) == msgtype.__name__]
@@ -175,11 +179,11 @@ class Recorder(Node):
             reliability=ReliabilityPolicy.RELIABLE if acknowledged else ReliabilityPolicy.BEST_EFFORT,
             durability=DurabilityPolicy.TRANSIENT_LOCAL if latched else DurabilityPolicy.VOLATILE,
         )
-        self._writer.add_topic(topic, typed[0].topic_type, offered_qos(reliable, latched, offered[0].depth or 1))
+        self._writer.add_topic(name, typed[0].topic_type, offered_qos(reliable, latched, offered[0].depth or 1))
         publishers = Publishers()
         self._counted += [publishers] if msgtype in (JointState, Imu, Vector3Stamped) else []
         self._topics[topic] = PolledSubscription(
-            self, msgtype, topic, partial(self._on_message, topic, publishers), qos, raw=True
+            self, msgtype, topic, partial(self._on_message, name, publishers), qos, raw=True
         )
 
     def _on_message(self, topic: str, publishers: Publishers, data: bytes, info: dict[str, Any]) -> None:
