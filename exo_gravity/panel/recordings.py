@@ -52,6 +52,10 @@ def programs() -> dict[str, list[str]]:
     return {name: [path, *PROGRAMS[name][1:]] for name, path in found.items() if path}
 
 
+def _runs(recorder: Launcher | None) -> bool:
+    return recorder is not None and recorder.exit_code(RECORDER) is None
+
+
 class Recordings:
     """`files` of `exo_gravity.panel.control.Control`: a request of a page is a coroutine function of the same name.
 
@@ -79,13 +83,14 @@ class Recordings:
 
     def state(self) -> dict[str, Any]:
         """Return what the page shows."""
-        is_on = self._is_recording() or self._progress["phase"] == "running"
+        recorder = self._recorder  # requests, on another thread, change it
+        is_on = _runs(recorder) or self._progress["phase"] == "running"
         recording = {
             "on": is_on,
             "foreign": not is_on and RECORDER in self._device.parameters(),
             "folder": str(self._folder or "") if is_on else "",
             "seconds": round(self._clock() - self._began) if is_on else 0,
-            "problem": self._ending(self._recorder) if self._recorder and not is_on else "",
+            "problem": self._ending(recorder) if recorder and not is_on else "",
         }
         folder = str(self._output / self._present["subject"])
         session = {**self._present, "folder": folder, "wearer": self._wearer}
@@ -282,9 +287,6 @@ class Recordings:
         """Return the name of this folder for `file`, '' if it has no such part."""
         return folder.relative_to(self._output).as_posix() if (folder / part).exists() else ""
 
-    def _is_recording(self) -> bool:
-        return self._recorder is not None and self._recorder.exit_code(RECORDER) is None
-
     def _ending(self, recorder: Launcher) -> str:
         return f"the recorder ended with exit code {recorder.exit_code(RECORDER)}: see {self._folder}/recorder.log"
 
@@ -293,7 +295,7 @@ class Recordings:
 
     def _occupied(self) -> str:
         """Return why no recording can start, or ''."""
-        if self._is_recording() or self._is_in_trial():
+        if _runs(self._recorder) or self._is_in_trial():
             return "a recording is running already"
         return "another recorder is running already" if RECORDER in self._device.parameters() else ""
 

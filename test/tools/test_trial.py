@@ -18,6 +18,7 @@ from concurrent.futures import Future
 from dataclasses import replace
 from functools import partial
 from subprocess import PIPE
+from unittest.mock import Mock
 
 import imageio.v3 as iio
 import numpy as np
@@ -292,6 +293,12 @@ def test_the_clock_leads_a_person_through_the_steps():
     screen.at(LEAD + 6.1, (0.01, 0.0, 0.0, 0.0))
     assert screen.done
     assert screen.printed == ["bring the arm to 6 34 69 29 deg, then let go", "hands off for 4 s", "drifted 0.57 deg"]
+
+
+def test_a_start_in_the_last_second_that_is_allowed_leaves_time_for_the_whole_script():
+    screen, moments = Screen(), iter((59.0, 66.5, 70.1, 70.6))
+    stopped = Mock(**{"wait.side_effect": lambda _: screen.at(next(moments)) and None, "is_set.return_value": False})
+    assert screen.end_of_trial(stopped=stopped) == "" and screen.done
 
 
 WEARERS_MOVE = "the wearer brings the arm to 6 34 69 29 deg"

@@ -129,7 +129,6 @@ class Decoder:
 
     def __init__(self, msgtype: str) -> None:
         self.msgtype, self.damaged, self.problem = msgtype, 0, ""
-        self._known: dict[int, Layout] = {}  # the last layout by the length of its messages
 
     def decode(self, messages: Messages) -> Iterator[tuple[np.ndarray, Layout, np.ndarray]]:
         """Yield the messages of each layout: which of `messages` they are (n,), the layout, and their numbers (n,)."""
@@ -138,20 +137,16 @@ class Decoder:
             left = np.flatnonzero(lengths == length)
             content = messages.data if len(left) == len(lengths) else [messages.data[n] for n in left.tolist()]
             rows = np.frombuffer(b"".join(content), np.uint8).reshape(-1, length)
-            layout = self._known.get(length)
             while len(left):
                 try:
-                    layout = layout or layout_of(rows[0].tobytes(), self.msgtype)
+                    layout = layout_of(rows[0].tobytes(), self.msgtype)
                 except DataError as error:
                     self.damaged, self.problem = self.damaged + 1, str(error)
                     left, rows = left[1:], rows[1:]
                     continue
                 same = (rows[:, layout.where] == layout.shared).all(axis=1)
-                if same.any():
-                    self._known[length] = layout
-                    yield left[same], layout, rows[same].view(layout.numbers)[:, 0]
-                    left, rows = left[~same], rows[~same]
-                layout = None
+                yield left[same], layout, rows[same].view(layout.numbers)[:, 0]
+                left, rows = left[~same], rows[~same]
 
 
 class JointSeries(NamedTuple):

@@ -123,7 +123,7 @@ class TrialScreen:
 
     def wait(self, stopped: Stopping, recorder_code: Callable[[], int | None], nodes: Future[Any]) -> str:
         """Wait until the script is done; return '' or why the wait ended earlier."""
-        deadline = time.monotonic() + START_TIMEOUT + self.script.duration
+        deadline = self.clock() + START_TIMEOUT + (self.lead or 0.0) + self.script.duration
         while not stopped.wait(0.05) and not nodes.done():
             if (code := recorder_code()) is not None:
                 return f"the recorder ended with exit code {code} before the trial was done"
@@ -139,7 +139,7 @@ class TrialScreen:
                 return ""
             if self._start < math.inf and not self._all_active:
                 return "an arm is not active any more"
-            if time.monotonic() > deadline:
+            if self.clock() > deadline:
                 return f"the trial did not finish in time: {'; '.join(self.faults) or 'no node reports a fault'}"
         return STOPPED if stopped.is_set() else ""
 
