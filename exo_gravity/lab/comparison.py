@@ -4,7 +4,6 @@
 The paper's laws take the angle between joint 1's axis and gravity as theta_1, as in the compensator.
 """
 
-import csv
 import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
@@ -25,13 +24,13 @@ from exo_gravity.lab.anfis_training import GRID, Trained, axes_of, from_gravload
 from exo_gravity.lab.inputs.arms import ConfiguredArm
 from exo_gravity.lab.inputs.references import PAPER_ANALYTICAL, PAPER_ANFIS, PAPER_SECONDS, REFERENCES, gravload
 from exo_gravity.lab.report.html import JOINT_COLOURS, make_plain
+from exo_gravity.lab.report.table import write_rows
 
 TILTS = (0, 5, 10, 20, 30)  # degrees
 ROUNDING = 1e-12  # Nm; the exact law may differ this much from a reference
 LINK_ENDS, CONFIGURED = "at the link ends", "as configured"
 FLOOR, CEILING = 1e-7, 1.0  # Nm, ends of the colour scale
 FIGURE_GRID = (56, 56, 7)  # positions of joints 2, 3, 4 in the workspace figure
-COLUMNS = ("cog", "positions", "limit", "count", "law", "reference", "joint", "rmse", "largest", "rms_torque")
 # Overlapping lines stay visible, because the first are wider.
 STYLES = {"EQ2-EQ5": ("s-", 4.0), "EQ1m-EQ4m": ("D-", 2.0), "ANFIS": ("^--", 1.5), "exact": ("o-", 1.5)}
 
@@ -173,12 +172,16 @@ def _paper_table(part: Part) -> Iterator[str]:
 def write(link_ends: Part, as_configured: Part, output: Path) -> list[str]:
     """Write the rows as CSV, one column per field in Nm (`limit` in degrees), and the figures; return the names."""
     rows = link_ends.rows + as_configured.rows
-    with (output / "laws.csv").open("w", newline="", encoding="utf-8") as file:
-        writer = csv.writer(file)
-        writer.writerow(COLUMNS)
-        for *head, rmse, largest, rms_torque in rows:
-            numbers = zip(rmse.tolist(), largest.tolist(), rms_torque.tolist(), strict=True)
-            writer.writerows((*head, joint, *line) for joint, line in enumerate(numbers, start=1))
+    of_joints = [
+        {
+            **dict(zip(("cog", "positions", "limit", "count", "law", "reference"), row, strict=False)),
+            "joint": joint + 1,
+            **{name: getattr(row, name)[joint] for name in ("rmse", "largest", "rms_torque")},
+        }
+        for row in rows
+        for joint in range(4)
+    ]
+    write_rows(output / "laws.csv", of_joints)
     _workspace_figure(as_configured).savefig(output / "workspace.png", dpi=130)
     _tilt_figure(rows).savefig(output / "tilt.png", dpi=130)
     return ["laws.csv", "workspace.png", "tilt.png"]

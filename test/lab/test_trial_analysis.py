@@ -33,11 +33,6 @@ def recording(*pieces, **more):
     return measured(np.concatenate(pieces), **more)
 
 
-def two_poses():
-    """Return a recording with holds from 0 to 10 s and from 12 to 22 s."""
-    return recording(still(POSE_A, 10.0), smooth(POSE_A, POSE_B, 2.0), still(POSE_B, 10.0))
-
-
 def carried_until(end, steps=()):
     """Hang for 5 s, lift to `POSE_A` in 2 s, hold for 10 s, and let down from 17 s to 21 s."""
     pieces = (still(HANGING, 5.0), smooth(HANGING, POSE_A, 2.0), still(POSE_A, 10.0))
@@ -61,7 +56,7 @@ def failed(made, **criteria):
 
 
 def test_each_still_span_is_a_hold_of_its_mean_position_and_the_motion_between_them_is_a_move():
-    whole = two_poses()
+    whole = recording(still(POSE_A, 10.0), smooth(POSE_A, POSE_B, 2.0), still(POSE_B, 10.0))
     assert spans(whole) == [(0, 10), (12, 22)] == spans(sampled(whole, slice(None, None, 25)))  # at 20 Hz
     np.testing.assert_allclose([h.pose for h in analyse(whole).holds], [POSE_A, POSE_B], atol=2 * POSITION_CODE)
     assert kinds(whole) == ["move"]

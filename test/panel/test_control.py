@@ -228,9 +228,6 @@ for line in ({"folder": str(folder)}, {"step": 0, "left": 4.0}, LAST, {"problem"
 COMPENSATOR = {"mode": "one_g", "robot.mass": [0.5] * 4, "anfis": [], **WEARER_FILE}
 
 
-RUNNING = "a trial is running already"
-
-
 class Kept(Recordings):
     """Recordings below `folder / "out"` of an active arm, with the trial `short`; what a page is told and is noted."""
 
@@ -259,7 +256,9 @@ class Kept(Recordings):
         """Start the trial `short`; return what the page shows at each change until it is done."""
 
         async def follow():
-            assert sorted(await asyncio.gather(self.trial("short"), self.trial("short"))) == ["", RUNNING]
+            assert sorted(await asyncio.gather(self.trial("short"), self.trial("short"))) == [
+                "", "a trial is running already",
+            ]  # fmt: skip
             assert "stop the trial" in await self.stop_recording()
             shown = [self.state()]
             while shown[-1]["trial"]["phase"] != "done":
