@@ -302,7 +302,7 @@ class Storage:
         for file in self.files:
             with tempfile.TemporaryDirectory() as folder:
                 content = _decompressed(file, Path(folder)) if file.suffix.lower() in COMPRESSED else file
-                for _ in (self._mcap if kind_of(file) == ".mcap" else self._sqlite)(content, wanted):
+                for _ in (self._mcap if kind_of(file) == ".mcap" else self._sqlite)(file, content, wanted):
                     for topic, found in self._found.items():
                         ordinal, arrival, messages = zip(*found, strict=True)
                         times = np.array(arrival)
@@ -320,8 +320,11 @@ class Storage:
         else:
             self.damaged += 1
 
-    def _mcap(self, file: Path, wanted: Wanted) -> Iterator[None]:
-        """Take the messages of an MCAP file up to the end of its data or a cut; yield after each chunk."""
+    def _mcap(self, file: Path, unpacked: Path, wanted: Wanted) -> Iterator[None]:
+        """Take the messages of an MCAP file up to the end of its data or a cut; yield after each chunk.
+
+        unpacked: the file, or a copy of one that was compressed.
+        """
         schemas, chosen = {0: ""}, dict[int, Topic]()  # the wanted topics by channel
 
         def take(data: bytes) -> None:
@@ -349,7 +352,7 @@ class Storage:
                     if wanted(*topic):
                         chosen[channel.id] = topic
 
-        with file.open("rb") as stream:
+        with unpacked.open("rb") as stream:
             if stream.read(len(MAGIC)) != MAGIC:
                 raise DataError(f"{file}: not an MCAP file, or empty: must be {EXPECTED}")
             while len(head := stream.read(RECORD.size)) == RECORD.size:
@@ -365,13 +368,13 @@ class Storage:
                     yield
         yield
         if len(head) < RECORD.size or opcode != Opcode.DATA_END:
-            self.cut_short = f"{file.name} ends without an index, or is damaged"
+            self.cut_short = f"{unpacked.name} ends without an index, or is damaged"
 
-    def _sqlite(self, file: Path, wanted: Wanted) -> Iterator[None]:
-        """Take the messages of a database; yield now and then."""
+    def _sqlite(self, file: Path, unpacked: Path, wanted: Wanted) -> Iterator[None]:
+        """Take the messages of a database; yield now and then. unpacked: as in `_mcap`."""
         with tempfile.TemporaryDirectory() as folder, ExitStack() as stack:
             try:
-                database = stack.enter_context(closing(_opened(file, Path(folder))))
+                database = stack.enter_context(closing(_opened(unpacked, Path(folder))))
                 topics = {
                     key: (str(topic), str(kind))
                     for key, topic, kind in database.execute("SELECT id, name, type FROM topics")
@@ -383,7 +386,8 @@ class Storage:
                 )
             except (sqlite3.Error, OSError, UnicodeDecodeError) as error:
                 reason = " ".join(str(error).split())  # it may quote several lines of a damaged file
-                way = f"copy {file.name}-wal, too, if there is one, or recover it by `sqlite3 {file.name} .recover`"
+                name = unpacked.name
+                way = f"copy {name}-wal, too, if there is one, or recover it by `sqlite3 {name} .recover`"
                 raise DataError(f"{file}: not a rosbag2 database, or damaged ({reason}): {way}") from None
             self.topics.update(topics.values())
             try:
@@ -395,7 +399,7 @@ class Storage:
                             self.damaged += 1
                     yield
             except sqlite3.Error:  # the rows before the damage are kept
-                self.cut_short = f"{file.name} is cut or damaged"
+                self.cut_short = f"{unpacked.name} is cut or damaged"
 
 
 def _opened(file: Path, folder: Path) -> sqlite3.Connection:

@@ -202,6 +202,7 @@ DAMAGE = {  # the form, what is done to its file, and what is said
     "CREATE": (FORMS[0], replaced(b"CREATE TABLE topics", b"CREA\xccE TABLE topics"), "not a rosbag2 database.*-wal"),
     "BLOB": (FORMS[0], replaced(b"data BLOB NOT", b"data BLOB`NOT"), "not a rosbag2 database"),
     "cut": (FORMS[0], lambda file: made.cut(file, 0.6), "not a rosbag2 database, or damaged"),
+    "cut, compressed": (FORMS[1], lambda file: made.cut(file, 0.3), r"bag/bag\.db3\.zstd: not a rosbag2 database"),
     "empty": (FORMS[0], lambda file: file.write_bytes(b""), "not a rosbag2 database"),
     "texts": (FORMS[0], with_topics_as_texts, f"the recording is damaged: parts left out: {len(CONTENT)}"),
     "head": (FORMS[4], lambda file: file.write_bytes(bytes(4) + file.read_bytes()[4:]), "compressed file is damaged"),
