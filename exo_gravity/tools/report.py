@@ -102,7 +102,7 @@ def _run(options: argparse.Namespace) -> int:
     output, part = Path(options.output or beside), Part(options.joints, options.start, options.end)
     written = sorted([*_export(options, output, lambda: [bag]), *trial_report.write(report, output, on_paper, part)])
     if clip:
-        clip.write(bag, screen)
+        clip(bag, screen)
     trial_report.print_report(report)
     print(f"Written: {', '.join(path.name for path in written)} in {output}")
     return report.exit_code

@@ -54,13 +54,13 @@ def _run(options: argparse.Namespace) -> int:
     if options.offline:
         with extras("trial", "sim"):
             from exo_gravity.lab.trial.offline import record_offline
-        end = record_offline(trial, console, stopped.is_set)
+        trouble = record_offline(trial, console, stopped.is_set)
     else:
         trial.prepare()
         tell(folder=str(folder))
-        end = run_trial(trial, console, stopped, lambda step, left: tell(step=step, left=round(left, 1)))
+        trouble = run_trial(trial, console, stopped, lambda step, left: tell(step=step, left=round(left, 1)))
         tell(phase="reporting")
-    trouble, code = end.trouble, end.code
+    code = 1
     try:
         bag = read_bag(folder / "bag")
     except DataError:
@@ -68,12 +68,12 @@ def _run(options: argparse.Namespace) -> int:
             raise
     else:
         report, trouble = analysed(bag, script, guided, trouble)
-        code = code or int(bool(trouble)) or report.exit_code
+        code = int(bool(trouble)) or report.exit_code
         trial_report.write(report, folder)
         if not options.attach:
             trial_report.print_report(report)
         if clip:
-            clip.write(bag, console)
+            clip(bag, console)
     log = "" if options.offline else ", log"
     console.print(f"Report, recording{log} and parameters: {folder}", markup=False, soft_wrap=True)
     if trouble:

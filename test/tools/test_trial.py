@@ -369,8 +369,6 @@ CLIPS = {  # the file, the speed, the packages that are needed, and what is said
 
 @pytest.mark.parametrize(("video", "speed", "needed", "said"), CLIPS.values(), ids=CLIPS)
 def test_a_wrong_clip_is_refused_before_the_trial(tmp_path, monkeypatch, video, speed, needed, said):
-    for kind, step in (("gif", 0.4), ("mp4", 0.16)):
-        assert clips.requested(str(tmp_path / f"clip.{kind}"), 4.0).step == pytest.approx(step)
     monkeypatch.setattr(clips, "NEEDED", needed)
     with pytest.raises(ParameterError, match=said):
         clips.requested(str(tmp_path / video), speed)

@@ -2,9 +2,10 @@
 """Where a clip goes, and whether this computer has what draws it: checked before a trial runs, not after."""
 
 import argparse
+from collections.abc import Callable
 from importlib.util import find_spec
 from pathlib import Path
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING
 
 from exo_gravity.core.errors import ParameterError
 from exo_gravity.core.numbers import one_float
@@ -16,22 +17,6 @@ if TYPE_CHECKING:
 
 FRAME_RATE = {".mp4": 25, ".gif": 10}  # frames per second
 NEEDED = ("imageio", "av", "PIL")
-MAX_SPEED = 100.0
-
-
-class Clip(NamedTuple):
-    """A clip to write."""
-
-    path: Path
-    step: float  #: s of the recording from one frame to the next
-    frame_rate: int  #: frames per second
-
-    def write(self, bag: Bag, console: "Console") -> None:
-        """Write the clip of a recording, and print where it is. Raises DataError."""
-        from exo_gravity.lab.report.clip import write_clip  # by packages that only clips need
-
-        write_clip(bag, *self, console)
-        console.print(f"Clip: {self.path}", markup=False, soft_wrap=True)
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -41,8 +26,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     option("--video-speed", type=float, default=1.0, metavar="X", help="speed of the clip (%(default)s)")
 
 
-def requested(video: str | None, speed: float) -> Clip | None:
-    """Return the clip of the command line, None for none.
+def requested(video: str | None, speed: float) -> Callable[[Bag, "Console"], None] | None:
+    """Return what writes the clip of the command line of a recording, and prints where it is; None for no clip.
 
     Raises ParameterError for a wrong file or speed, and if a package is missing.
     """
@@ -54,8 +39,15 @@ def requested(video: str | None, speed: float) -> Clip | None:
     if not path.absolute().parent.is_dir():
         raise ParameterError("video", video, "a file in a folder that exists")
     frame_rate = FRAME_RATE[path.suffix.lower()]
-    clip = Clip(path, one_float("video_speed", speed, 0.1, MAX_SPEED) / frame_rate, frame_rate)
+    step = one_float("video_speed", speed, 0.1, 100.0) / frame_rate  # s of the recording
     for module in NEEDED:
         if not find_spec(module):
             raise ParameterError("video", video, f"left out: {missing(module, 'sim')}")
-    return clip
+
+    def write(bag: Bag, console: "Console") -> None:
+        from exo_gravity.lab.report.clip import write_clip  # by packages that only clips need
+
+        write_clip(bag, path, step, frame_rate, console)
+        console.print(f"Clip: {path}", markup=False, soft_wrap=True)
+
+    return write

@@ -38,7 +38,7 @@ from exo_gravity.lab.bag.writer import BagWriter, Message, offered_qos
 from exo_gravity.lab.inputs.arms import node_values, read_arm
 from exo_gravity.lab.inputs.parameter_file import load, node_of
 from exo_gravity.lab.trial.analysis import ARRAYS, CARRIED, Recording, ScriptedStep, Span
-from exo_gravity.lab.trial.run import GRACE, STOPPED, Trial, TrialEnd
+from exo_gravity.lab.trial.run import GRACE, STOPPED, Trial
 from exo_gravity.sim.controllers import DirectController
 from exo_gravity.sim.device import SimulatedDevice, VirtualWearer
 from exo_gravity.sim.params import device_of, imu_of, set_faults, simulator_table
@@ -215,10 +215,11 @@ def simulated_trials(params: Path, script: TrialScript) -> list[OfflineTrial]:
     return trials
 
 
-def record_offline(trial: Trial, console: Console, should_stop: Callable[[], bool]) -> TrialEnd:
+def record_offline(trial: Trial, console: Console, should_stop: Callable[[], bool]) -> str:
     """Prepare and run a trial on the simulated arms of its parameter file, and record it in the folder `bag`.
 
-    Raises ParameterError for a wrong parameter, DataError if nothing was recorded or it cannot be written.
+    Returns '' or why one ended before its script. Raises ParameterError for a wrong parameter, DataError if nothing was
+    recorded or it cannot be written.
     """
     assert trial.params is not None, "arms that are carried already are not simulated here"
     simulated = simulated_trials(trial.params, trial.script)
@@ -242,8 +243,7 @@ def record_offline(trial: Trial, console: Console, should_stop: Callable[[], boo
     }
     trunk = next((one.trunk for one in simulated if one.trunk), [])  # both arms hang on one
     write_recordings(trial.folder / "bag", recordings, events, texts, trial.session, trunk)
-    trouble = next((one.trouble for one in simulated if one.trouble), "")
-    return TrialEnd(trouble, int(bool(trouble)))
+    return next((one.trouble for one in simulated if one.trouble), "")
 
 
 def trunk_imu(config: ImuConfig, rotation_trunk_from_imu: Sequence[float], cycle_rate: float) -> TrunkSensor:

@@ -289,18 +289,12 @@ class Trial:
         return path
 
 
-@dataclass(frozen=True)
-class TrialEnd:
-    """How a trial ended."""
-
-    trouble: str = ""  #: why it ended before the script, or ''
-    code: int = 0  #: the exit code for that
-
-
-def run_trial(trial: Trial, console: Console, stopped: Stopping, on_progress: Callable[[int, float], None]) -> TrialEnd:
+def run_trial(trial: Trial, console: Console, stopped: Stopping, on_progress: Callable[[int, float], None]) -> str:
     """Run a trial that is prepared until the script is done, a fault latches or `stopped` is set.
 
     on_progress: as in `TrialScreen`.
+
+    Returns '' or why it ended before the script. Raises ParameterError if a node refused its parameters or bus.
     """
     # On arms that are carried already the clock leads: a simulator's newest step may be that of an earlier trial.
     lead = LEAD if trial.guided else START_TIME if trial.params is None else None
@@ -331,11 +325,13 @@ def run_trial(trial: Trial, console: Console, stopped: Stopping, on_progress: Ca
     if dead := nodes.result():
         node, code = dead
         trouble = f"{node.lstrip('/')} ended with exit code {code}: {last_errors.get(node, f'see {path}')}"
-        return TrialEnd(trouble, 2 if code == 2 else 1)
+        if code == 2:
+            raise ParameterError("params", str(trial.params), f"a file whose nodes start ({trouble})")
+        return trouble
     if trouble in ("", STOPPED):
-        return TrialEnd(trouble, int(bool(trouble)))
+        return trouble
     recorder = f": {last_errors[RECORDER]}" if RECORDER in last_errors else ""
-    return TrialEnd(f"{trouble}{recorder}{stall_of(screen.status)}", 1)
+    return f"{trouble}{recorder}{stall_of(screen.status)}"
 
 
 def stall_of(status: Mapping[str, Mapping[str, Any]]) -> str:
