@@ -110,15 +110,11 @@ def sprung(device: Device) -> list[Observation]:
     return [one._replace(effort=one.effort + 0.15 * np.subtract(one.theta, 0.4) / device.scale) for one in tour]
 
 
-def test_springs_are_found_where_there_are_some_and_nowhere_else_nor_where_a_hand_was_on_the_arm_in_one_pose() -> None:
+def test_springs_are_found_where_there_are_some_and_nowhere_else() -> None:
     found = identify(sprung(Device(300)), PAPERS)
     np.testing.assert_allclose(found.value.spring[1:], 0.15, atol=0.02)
     assert np.all(np.abs(found.value.spring - 0.15)[1:] < 3.5 * found.error.spring[1:])
     assert np.max(identify(Device(300).tour(bare=8, weighed=8), PAPERS).value.spring) < 0.01
-    tour = Device(7).tour(bare=12, weighed=0)
-    tour[5] = tour[5]._replace(effort=tour[5].effort + np.array((0.0, 0.0, 0.8, 0.0)))
-    found = identify(tour, PAPERS)
-    assert list(found.rejected) == [5] and np.max(found.value.spring) < 0.01
 
 
 def test_the_file_gets_the_springs_and_the_room_that_the_safety_machine_needs_for_them() -> None:

@@ -13,9 +13,9 @@ places.
 
 Each unknown is known before, with a standard error: the moments as the file has them, the others as 0. What the poses
 do not show of it stays within that, and is part of the errors. A slope is fitted where the arm was seen cold and warm.
-A pose that is far off what the others predict was touched, and is left out.
 Errors are larger in some joints than the observations state (gear friction is not the same in every pose), so each
-joint gets a factor of its own, estimated from its residuals and pooled with the others where poses are few.
+joint gets a factor of its own, estimated from its residuals and pooled with the others where poses are few. A pose in
+which somebody touched the arm widens them: the result names the one that is farthest off what the others predict.
 
 A turn about a joint's axis is an error of its encoder's zero, one across it an axis askew. It shows where the joints
 beyond turn about another axis. The zero of the last joint does not, nor that of one whose next axis is parallel: they
@@ -83,10 +83,6 @@ class Fit:
     axis: float = 0.0107
     pooling: float = 2.0  #: degrees of freedom with which all joints together inform the error of each
     least_factor: float = 1e-4  #: of a variance, where poses agree by chance
-    outlier: float = 10.0  #: standard errors off the other poses, beyond which a pose is left out
-    #: Nm, and this share of the peak effort: a smaller error does no harm, nor does a hand cause it
-    least_outlier: float = 0.05
-    share_of_peak: float = 0.01  #: of the effort, likewise
     hidden: float = 0.7  #: part of the variance before, from which on an unknown is not known
     common: float = 0.5  #: part of the error before, from which on a weight shows no common factor of the scales
 
@@ -168,10 +164,6 @@ class Rows(NamedTuple):
     direction: np.ndarray  #: (m, 3), gravity's unit vector in the base frame, as measured
     load: np.ndarray  #: (m, k) kg m, moments of the weight
 
-    def only(self, keep: np.ndarray) -> "Rows":
-        """Return the poses that `keep` (m,) selects."""
-        return Rows(self.model, *(column[keep] for column in self[1:]))
-
     def predicted(self, unknowns: np.ndarray) -> np.ndarray:
         """Return the commanded effort (m, n) in Nm."""
         _, _, torque, given = self._parts(unknowns)
@@ -228,7 +220,6 @@ class Solution(NamedTuple):
     residual: np.ndarray  #: (m, n) Nm
     held_out: np.ndarray  #: (m, n) Nm, of a prediction from the other poses
     sigma: np.ndarray  #: (m, n) Nm, standard error of the effort as the residuals show it
-    freedom: np.ndarray  #: (n,), degrees of freedom of each joint's residuals
 
 
 def columns(observations: Sequence[Observation]) -> list[np.ndarray]:
@@ -280,7 +271,7 @@ def solve(rows: Rows, known: Known, effort: np.ndarray, spread: np.ndarray, pass
     covariance *= (1.0 + 1.25 / (freedom.min() + 6.0)) ** 2
     unknowns = np.where(known.error > EXACT, unknowns, known.start)
     error = np.where(hidden, np.inf, np.sqrt(np.diag(covariance)))
-    return Solution(unknowns, covariance, error, residual, held_out, sigma, freedom)
+    return Solution(unknowns, covariance, error, residual, held_out, sigma)
 
 
 @dataclass(frozen=True)
@@ -393,10 +384,8 @@ class Identified:
     tilt_covariance: np.ndarray
     temperature: np.ndarray  #: (n,) degC, mean of the motors, at which `scale` is true; NaN where not known
     friction: np.ndarray  #: (n,) Nm as commanded
-    residual: np.ndarray  #: (m, n) Nm, effort minus prediction
-    held_out: np.ndarray  #: (m, n) Nm, the same predicted without that pose
+    held_out: np.ndarray  #: (m, n) Nm, effort minus its prediction from the other poses
     unknown: tuple[str, ...]  #: sentences on what the poses do not show, and what would
-    rejected: dict[int, str]  #: why an observation is not used, by its index
     #: No weight was hung: the product of the compared scales is taken as 1, moments are in commanded torque.
     relative: bool
     torque_error: np.ndarray  #: (n,) Nm, standard error of the file's torque in other poses
@@ -418,19 +407,8 @@ def identify(observations: Sequence[Observation], model: MomentModel, places: Pl
     before = Unknowns.of(known.error, model)
     before.slope[np.ptp(warmth, axis=0) < FIT.least_warming] = EXACT
     spread = np.hypot(spread, FIT.least_spread)
-    alone = solve(rows, known, effort, spread)
-    least = np.maximum(FIT.least_outlier, FIT.share_of_peak * np.abs(effort).max(axis=0))
-    less = alone.residual * alone.held_out  # by which a joint's squared residuals fall without the pose
-    others = np.maximum((alone.residual**2).sum(axis=0) - less, (spread**2).sum(axis=0))
-    far = less > FIT.outlier**2 * others / np.maximum(alone.freedom - 1.0, EXACT)
-    touched = far & (np.abs(alone.held_out) > least)
-    rejected = {
-        pose: f"effort of joint {joint + 1} is {alone.held_out[pose, joint]:+.2f} Nm off what the other poses predict"
-        for pose, joint in np.argwhere(touched).tolist()
-    }
-    keep = ~touched.any(axis=1)
-    solution = solve(rows.only(keep), known, effort[keep], spread[keep])
-    typical, peak = np.median(np.abs(solution.residual), axis=0), np.abs(effort[keep]).max(axis=0)
+    solution = solve(rows, known, effort, spread)
+    typical, peak = np.median(np.abs(solution.residual), axis=0), np.abs(effort).max(axis=0)
     for joint in np.flatnonzero(typical > np.maximum(ACCEPTED.misfit * peak, ACCEPTED.least_misfit)):
         misfit = f"joint {joint + 1} is {typical[joint]:.2f} Nm off in half of the poses"
         raise DataError(f"the poses do not fit one arm: {misfit}. {DISTURBED}")
@@ -449,21 +427,16 @@ def identify(observations: Sequence[Observation], model: MomentModel, places: Pl
     grows = np.maximum((carried * friction).sum(axis=0) / np.maximum((carried**2).sum(axis=0), EXACT), LEAST_GROWTH)
     new = new_poses(model)
     unequal = UNEQUAL * grows * new.predicted(solution.unknowns)
-    misfit = np.sqrt(np.maximum(solution.sigma**2 - spread[keep] ** 2, 0.0).mean(axis=0))
+    misfit = np.sqrt(np.maximum(solution.sigma**2 - spread**2, 0.0).mean(axis=0))
     tilt = slice(sum(map(len, value[:3])), sum(map(len, value[:4])))
-    residual = effort - rows.predicted(solution.unknowns)
-    held_out = residual.copy()
-    held_out[keep] = solution.held_out
     return Identified(
         value,
         error._replace(scale=value.scale * error.scale),
         solution.covariance[tilt, tilt],
         temperature.mean(axis=0),
         np.median(friction, axis=0),
-        residual,
-        held_out,
+        solution.held_out,
         tuple(_unknown(value.moment, hidden, is_relative, model)),
-        rejected,
         is_relative,
         torque_error(new, solution, np.hypot(unequal, misfit)),
     )

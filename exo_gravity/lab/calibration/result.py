@@ -215,15 +215,14 @@ def torque_figure(found: Identified, arm: ConfiguredArm, model: MomentModel, pos
     figure = Figure(figsize=(FIGURE_WIDTH, ROW_HEIGHT * count), layout="constrained")
     theta, _, _, spread = columns(poses)
     old, new = remainders(found, arm, model, poses)
-    used = ~np.isin(numbers - 1, list(found.rejected))
     axes, colours = figure.subplots(count, 1, squeeze=False)[:, 0], joint_colours(count)
     for joint, (axis, colour, name) in enumerate(zip(axes, colours, arm.joint_names, strict=True)):
         friction = found.friction[joint]
         axis.axhspan(-friction, friction, color=HOLD_COLOUR, lw=0, zorder=0, label="friction holds")
         axis.axhline(0.0, color=FAINT, lw=0.6, zorder=0)
-        axis.plot(numbers[used] - 0.12, old[used, joint], "o", ms=5, mfc="none", color=INK, label="old file")
+        axis.plot(numbers - 0.12, old[:, joint], "o", ms=5, mfc="none", color=INK, label="old file")
         axis.errorbar(
-            numbers[used] + 0.12, new[used, joint], 2.0 * spread[used, joint], fmt="o", ms=4.5, lw=1.2, color=colour,
+            numbers + 0.12, new[:, joint], 2.0 * spread[:, joint], fmt="o", ms=4.5, lw=1.2, color=colour,
             label="new file, this pose held out, ± 2 standard errors",
         )  # fmt: skip
         axis.set(xlim=(0.4, len(numbers) + 0.6), ylabel="Remainder (Nm)")
@@ -231,8 +230,7 @@ def torque_figure(found: Identified, arm: ConfiguredArm, model: MomentModel, pos
         axis.set_title(name, fontsize=10, color=colour, loc="left", weight="bold")
         make_plain(axis)
     rows = [[str(n), *(f"{angle:.0f}" for angle in pose)] for n, pose in zip(numbers, np.degrees(theta), strict=True)]
-    ticks = ["\n".join(row if kept else [*row, "left out"]) for row, kept in zip(rows, used, strict=True)]
-    axis.set_xticks(numbers, ticks, fontsize=8)
+    axis.set_xticks(numbers, map("\n".join, rows), fontsize=8)
     axis.set_xlabel("Pose, with its angles in degrees")
     figure.legend(*axis.get_legend_handles_labels(), loc="outside upper center", ncols=3, frameon=False, fontsize=9)
     return figure

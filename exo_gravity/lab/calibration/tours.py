@@ -391,10 +391,9 @@ def _lines(arm: ConfiguredArm, found: Identified) -> Iterator[str]:
     """Yield what the parameter file does not hold, in sentences."""
     for name, slide, offset in zip(arm.joint_names, found.friction, found.value.offset, strict=True):
         yield f"{name}: friction {slide:.2f} Nm, offset {offset:+.3f} Nm"
-    worst = float(np.nanmax(np.abs(found.held_out), initial=0.0))
-    yield f"largest torque error of a pose that was left out: {worst:.3f} Nm"
-    for index, reason in found.rejected.items():
-        yield f"pose {index + 1} was not used: {reason}"
+    pose, joint = np.unravel_index(np.argmax(np.abs(found.held_out)), found.held_out.shape)
+    worst = f"{found.held_out[pose, joint]:+.3f} Nm at {arm.joint_names[joint]} in pose {pose + 1}"
+    yield f"largest difference to what the other poses predict: {worst}: if it is large, was the arm touched?"
     yield from (f"Not shown by these poses: {what}" for what in found.unknown)
 
 
