@@ -373,8 +373,12 @@ def exact_law(arm: ConfiguredArm) -> Iterator[Change]:
 def _spring_changes(arm: ConfiguredArm, found: Identified) -> Iterator[Change]:
     """Yield the device's own springs, and the torque that they may add beyond gravity, where the file states one."""
     node, before, value = f"{arm.namespace}/compensator", joint_spring_of(arm.compensator), found.value
+    stiffness = value.spring.round(4)
+    if not (np.any(stiffness) or before.on):
+        return
     slack = value.turn[:, 0] - value.offset * value.scale / np.maximum(value.spring, EXACT)
-    new = Springs(value.spring.round(4).tolist(), np.clip(slack, -MAX_REST, MAX_REST).round(4).tolist())
+    rest = np.where(stiffness > 0.0, np.clip(slack, -MAX_REST, MAX_REST), 0.0)
+    new = Springs(stiffness.tolist(), rest.round(4).tolist())
     note = f"Nm/rad, +-{row(found.error.spring)}"
     yield Change(node, "joint_spring.stiffness", list(new.stiffness), note)
     yield Change(node, "joint_spring.rest", list(new.rest), "rad, with the offset of the motor")
