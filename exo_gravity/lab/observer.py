@@ -447,6 +447,7 @@ class SupportAdaptation:
             self.shares = _shares(self._means, 1.0)
         else:
             self._means, self.shares = 0.0, None
+        if not (self.shares and is_carried and settings.is_adaptive):
             self._theta, self._speed = None, 0.0
         if not settings.is_adaptive or dt > REQUEST.expires:
             self.requested = None
@@ -454,14 +455,12 @@ class SupportAdaptation:
         self.support += lowered
         in_force = max(settings.support, (self.requested or 0.0) + lowered)
         if not settings.is_adaptive or not is_running:
-            self._theta, self._speed = None, 0.0
             self.support, self.problem = in_force, ""
             return
         sunk = 0.0
         if joints and estimate and is_carried:
             sunk = self._sunk(dt, joints, estimate.weight, 1.0 - in_force)
         else:
-            self._theta, self._speed = None, 0.0
             self.problem = "the wearer's torque is not known" if is_carried else "the arm is not carried"
         rise = ADAPTATION.rise
         fall = rise if self.problem else (self.support - settings.support) / ADAPTATION.memory

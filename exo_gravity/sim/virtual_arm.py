@@ -16,7 +16,6 @@ from exo_gravity.core.arm.tilt import Tilt, gravity_in_trunk
 from exo_gravity.core.compensation.compensator import Compensator
 from exo_gravity.core.errors import ParameterError
 from exo_gravity.core.motors.joint_motor import JointMotor
-from exo_gravity.core.safety.command import Command
 from exo_gravity.core.safety.limits import HANGING, Limits
 from exo_gravity.hardware.can_port import CanPort
 from exo_gravity.hardware.control_loop import Controller, ControlLoop
@@ -52,8 +51,7 @@ class VirtualArm:
     motors, limits: the arm as the controller's side assumes it; whoever starts a simulated arm has seen it hang.
     rate: cycles of the loop per s.
     wire: the bus; by default one of its own, whose clock is at 0 s.
-    ports, played: of each joint's motor, and how the device is connected; by default one port for all, on `wire`.
-    note: that of `MotorBus`.
+    bus, played: how loop and device are connected to it; by default by one port each.
 
     clock, wire, loop, safety, bus: what runs the arm.
     """
@@ -66,17 +64,18 @@ class VirtualArm:
         limits: Limits,
         rate: float,
         wire: Wire | None = None,
-        ports: Sequence[CanPort | None] | None = None,
+        bus: MotorBus | None = None,
         played: Played | None = None,
-        note: Callable[[Command], None] = lambda command: None,
     ) -> None:
         self.device = device
         self.wire = wire or Wire(start=0.0)
         self.clock = self.wire.clock
         self._played = played or self.wire.play(device, tick=None)
-        if ports is None:
-            ports = [CanPort(self.wire.open(), self.clock, self.wire.open, any(device.is_fd))] * len(motors)
-        self.bus = MotorBus(ports, motors, note=note, clock=self.clock)
+        self.bus = bus or MotorBus(
+            [CanPort(self.wire.open(), self.clock, self.wire.open, any(device.is_fd))] * len(motors),
+            motors,
+            clock=self.clock,
+        )
         self.loop = ControlLoop(self.bus, replace(limits, start_pose=HANGING), 1.0 / rate, controller)
         self.safety = self.loop.safety
 

@@ -171,9 +171,9 @@ class CarriedArm(JudgedArm):
         for name, end in self.wires.items():
             own = [joint for joint, of_joint in enumerate(channels) if of_joint == name]
             played = end.play(device, tick=None, joints=own, first=played)
-        ports = self.on_bus.ports(wire.clock)
-        both: dict[str, Any] = {"ports": ports, "played": played, "note": self.notes.note}
-        super().__init__(device, Settings("right", DEFAULT_LINKS, **given), joints, kept, rate, wire, **both)
+        bus = MotorBus(self.on_bus.ports(wire.clock), joints, note=self.notes.note, clock=wire.clock)
+        own_settings = Settings("right", DEFAULT_LINKS, **given)
+        super().__init__(device, own_settings, joints, kept, rate, wire, bus=bus, played=played)
 
     def leave(self) -> CarriedArm:
         """Let the bridge die: its motors keep what it noted."""
