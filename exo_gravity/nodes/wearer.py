@@ -209,9 +209,8 @@ class WearerNode(ThreadedNode):
         if settings is None:
             self._refusal = Status(NoEstimate.NO_DESCRIPTION, f"waiting for the arm's URDF on {values['urdf.topic']}")
             return
-        topic = "joint_states"
-        if values.get("command_interface") == "multi_array":
-            topic = values["multi_array.joint_states"]
+        is_multi_array = values.get("command_interface") == "multi_array"
+        topic = values["multi_array.joint_states"] if is_multi_array else "joint_states"
         urdf = (values.get(f"urdf.{part}") for part in ("file", "topic", "hand"))
         fixed = (values["joint_names"], settings.side, settings.use_imu, topic, *urdf)
         if self._watch is None:

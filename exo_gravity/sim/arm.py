@@ -291,7 +291,7 @@ class SimulatedArm:
         count = len(self.config.joint_stiffness)
         self._theta, self._velocity = self.data.qpos[:count], self.data.qvel[:count]
         self._torque, self._damping = self.data.qfrc_applied, self.model.dof_damping
-        self._viscous, self._is_damped = self._damping.copy(), False
+        self._viscous = self._damping.copy()
         self._motors = self.config.motors_among(self.model.nv)
         self.is_elastic = bool(self.config.elastic)  #: whether motors move apart from their links
         self._substeps = round(STEP / self.model.opt.timestep)
@@ -362,13 +362,11 @@ class SimulatedArm:
         """
         own, motors = torque if of_motors is None else of_motors, self._motors
         drive = own if self.is_elastic else torque
+        self._damping[:] = self._viscous
         if any(damping):
             # MuJoCo applies it implicitly: a step of constant torque would shake a light arm
-            self._damping[:] = self._viscous
             self._damping[motors] += damping
-            self._is_damped, drive = True, drive + self.data.qvel[motors] * damping
-        elif self._is_damped:
-            self._damping[:], self._is_damped = self._viscous, False
+            drive = drive + self.data.qvel[motors] * damping
         if self.is_elastic:
             self._torque[:] = 0.0
             self._torque[motors] = drive

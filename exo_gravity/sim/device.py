@@ -385,10 +385,8 @@ class SimulatedDevice:
             on = [motor.entered for motor in self.motors]
             step = -1 if self.wearer.step is None else self.wearer.step
             self.truth.note(now, theta, velocity, torque, damping, arm.weight, given, tuple(self._frames), step, on)
-        prompt: Sequence[float] = ()
-        if any(damping):
-            each = zip(damping, self.motors, torque, strict=True)
-            prompt = [own if own and motor.damps_at_once(pull) else 0.0 for own, motor, pull in each]
+        each = zip(damping, self.motors, torque, strict=True)
+        prompt = [own if own and motor.damps_at_once(pull) else 0.0 for own, motor, pull in each]
         arm.step(list(map(operator.add, torque, given)), of_motors=torque, damping=prompt)
         self._steps += 1
 
