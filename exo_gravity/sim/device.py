@@ -159,10 +159,7 @@ class TruthRecords:
     @property
     def records(self) -> np.ndarray:
         """The records that are in memory, (n,) of RECORD."""
-        records = np.empty(len(self._rows), record_of(len(self._rows[0][1])) if self._rows else RECORD)
-        for name, column in zip(records.dtype.names or (), zip(*self._rows, strict=True), strict=False):
-            records[name] = column
-        return records
+        return np.array(self._rows, record_of(len(self._rows[0][1])) if self._rows else RECORD)
 
 
 MAX_CATCH_UP = 0.05  # s of physics simulated at once; after a longer stall the rest of the time is lost
