@@ -66,10 +66,9 @@ class Turn:
     def at(self, elapsed: float) -> TrunkState:
         """Return the trunk's state `elapsed` s after the motion began."""
         way, pace, change = minimum_jerk(elapsed / self.duration)
-        by = self.end[0] - self.start[0], self.end[1] - self.start[1]
-        pitch_rate, roll_rate = (angle * pace / self.duration for angle in by)
-        bow, lean = (angle * change / self.duration**2 for angle in by)
-        state = TrunkState(self.start[0] + way * by[0], self.start[1] + way * by[1], pitch_rate, roll_rate, bow, lean)
+        by = np.subtract(self.end, self.start)
+        parts = self.start + way * by, by * pace / self.duration, by * change / self.duration**2
+        state = TrunkState(*np.concatenate(parts).tolist())
         turning, spin_up = state.angular_velocity, state.angular_acceleration
         return state._replace(acceleration=acceleration_of(HIP_TO_SHOULDER, turning, spin_up))
 
@@ -120,12 +119,10 @@ class SitDown:
 
     def at(self, elapsed: float) -> TrunkState:
         """Return the trunk's state `elapsed` s after the motion began."""
-        up, begin = 0.0, 0.0
-        for sign, duration in ((-1.0, DESCENT), (1.0, IMPACT)):
-            if begin <= elapsed < begin + duration:
-                peak = math.pi * SEAT_SPEED / (2.0 * duration)
-                up = sign * peak * math.sin(math.pi * (elapsed - begin) / duration)
-            begin += duration
+        falls = elapsed < DESCENT
+        since, duration = (elapsed, DESCENT) if falls else (elapsed - DESCENT, IMPACT)
+        peak = math.pi * SEAT_SPEED / (2.0 * duration) * (-1.0 if falls else 1.0)
+        up = peak * math.sin(math.pi * since / duration) if 0.0 <= since < duration else 0.0
         return TrunkState(*self.start, acceleration=_in_trunk((0.0, 0.0, up), *self.start))
 
 
