@@ -37,20 +37,11 @@ from exo_gravity.sim.controllers import SampleController
 
 
 @dataclass(frozen=True)
-class GuessTuning:
-    """What the expected torque does not explain."""
+class TourTuning:
+    """What the expected torque leaves, which poses may be visited, and the sweeps that show friction."""
 
     unexplained: float = 0.05  #: Nm: standard deviation of what no unknown explains,
     share: float = 0.03  #: of the torque, in addition: zeros and axes that are off
-
-
-GUESS = GuessTuning()
-
-
-@dataclass(frozen=True)
-class PoseChoice:
-    """Which poses may be visited, and which of them shows most."""
-
     candidates: int = 800  #: random poses, of which those above the horizontal are left out
     most_upwards: float = 0.3  #: sine of the largest angle above the horizontal, of links 3 and 4
     effort_share: float = 0.85  #: of max_effort that a pose may need
@@ -59,21 +50,12 @@ class PoseChoice:
     waypoints: int = 4  #: of the way to a pose, at which the motors must hold the arm too
     first_edge: float = 0.1  #: rad in addition, at the first pose
     edge: float = 0.02  #: rad between a sweep's end and the soft wall
-
-
-CHOICE = PoseChoice()
-
-
-@dataclass(frozen=True)
-class FrictionSweeps:
-    """The sweeps of the hanging arm that show its friction."""
-
     speeds: tuple[float, ...] = (0.02, 0.05, 0.1, 0.18, MOTION.speed)  #: rad/s, at which friction is measured
     time: float = 1.2  #: s of such a sweep's half at steady speed
     amplitude: tuple[float, float] = (0.05, 0.3)  #: rad, smallest and largest
 
 
-SWEEPS = FrictionSweeps()
+TOUR = TourTuning()
 
 
 class TorqueGuess:
@@ -98,7 +80,7 @@ class TorqueGuess:
             theta, direction, effort, spread = columns(seen)
             hung = np.array([model.load(one.load_mass, one.load_lever) for one in seen])
             rows = rows_at(model, theta, direction)._replace(load=hung)
-            unexplained = np.hypot(GUESS.unexplained, GUESS.share * effort)
+            unexplained = np.hypot(TOUR.unexplained, TOUR.share * effort)
             fit = solve(rows, known, effort, np.hypot(spread, unexplained), passes=1)
             self._unknowns, self._covariance = fit.unknowns, fit.covariance
         value = Unknowns.of(self._unknowns, model)
@@ -157,7 +139,7 @@ class Itinerary:
             room = self._room(poses, tour)
             if room.max() < 0.0:
                 raise DataError("no further pose can be held within max_effort: is it too small for the arm?")
-            possible = np.flatnonzero(room >= min(CHOICE.deviations, math.floor(room.max())))
+            possible = np.flatnonzero(room >= min(TOUR.deviations, math.floor(room.max())))
             seen = [one.theta for one in tour.measured] or [hanging(self.limits).theta]
             index = possible[next_pose(seen, poses[possible], tour.down, tour.guess.moments, tour.guess.model)]
             yield Station(tuple(poses[index].tolist()))
@@ -170,13 +152,13 @@ class Itinerary:
 
         It is in standard deviations of the expected torque, below 0 where they have none.
         """
-        shares = np.linspace(0.0, 1.0, CHOICE.waypoints + 1)[1:, None, None]
+        shares = np.linspace(0.0, 1.0, TOUR.waypoints + 1)[1:, None, None]
         sweep = MOTION.amplitude * np.array((-1.0, 1.0))[:, None, None]
         there, home = (start + shares * (poses - start) for start in (tour.position, np.array(self.limits.home)))
         ways = np.vstack((there, poses + sweep, home))
         mean, deviation = tour.guess.torques(ways.reshape(-1, poses.shape[1]), tour.down)
-        slide = np.where(tour.friction, tour.friction, CHOICE.usual_friction)
-        most = CHOICE.effort_share * np.array(self.limits.max_effort) - slide
+        slide = np.where(tour.friction, tour.friction, TOUR.usual_friction)
+        most = TOUR.effort_share * np.array(self.limits.max_effort) - slide
         room = (most - np.abs(mean)) / deviation
         return np.asarray(room.min(axis=1).reshape(len(ways), -1).min(axis=0))
 
@@ -185,14 +167,14 @@ def hanging(limits: Limits, speed: float = 0.1, amplitude: float = MOTION.amplit
     """Return the hanging arm, farther off the soft walls than other poses: friction is not known there at first."""
     low, high = measurable(limits, amplitude)
     return Station(
-        tuple(np.clip(limits.home, low + CHOICE.first_edge, high - CHOICE.first_edge).tolist()), speed, amplitude
+        tuple(np.clip(limits.home, low + TOUR.first_edge, high - TOUR.first_edge).tolist()), speed, amplitude
     )
 
 
 def friction_stations(limits: Limits) -> list[Station]:
     """Return sweeps through the hanging arm at each speed; the first lets the controller learn the friction."""
-    speeds = (0.1, *SWEEPS.speeds)
-    amplitudes = np.clip(np.array(speeds) * SWEEPS.time, *SWEEPS.amplitude).tolist()
+    speeds = (0.1, *TOUR.speeds)
+    amplitudes = np.clip(np.array(speeds) * TOUR.time, *TOUR.amplitude).tolist()
     return [hanging(limits, *sweep) for sweep in zip(speeds, amplitudes, strict=True)]
 
 
@@ -202,14 +184,14 @@ def candidates(limits: Limits, model: MomentModel) -> np.ndarray:
     Above the shoulder gravity tips the arm over: what is wrong with the expected torque grows with each movement.
     """
     low, high = measurable(limits, MOTION.amplitude)
-    poses = np.random.default_rng(1).uniform(low, high, (CHOICE.candidates, model.count))
+    poses = np.random.default_rng(1).uniform(low, high, (TOUR.candidates, model.count))
     home = float(model.upwards(np.array([limits.home]))[0])  # a link may point upwards in every pose
-    return np.asarray(poses[model.upwards(poses) <= max(CHOICE.most_upwards, home)])
+    return np.asarray(poses[model.upwards(poses) <= max(TOUR.most_upwards, home)])
 
 
 def measurable(limits: Limits, amplitude: float) -> tuple[np.ndarray, np.ndarray]:
     """Return the lowest and highest pose (n,) rad around which a sweep of `amplitude` rad stays off the soft walls."""
-    margin = WALL.width + amplitude + CHOICE.edge
+    margin = WALL.width + amplitude + TOUR.edge
     return np.array(limits.position_min) + margin, np.array(limits.position_max) - margin
 
 

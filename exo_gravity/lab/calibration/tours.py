@@ -468,7 +468,7 @@ MOST_CARRIED = 0.5  # share of their arm that a person can hold who means to rel
 
 @dataclass(frozen=True)
 class WearerTour:
-    """The tour of a worn arm."""
+    """The tour of a worn arm, and what is known of a person's relaxed arm."""
 
     poses: int = 8  #: the hanging arm and seven others
     again: int = 2  #: of them, visited again at the end
@@ -479,12 +479,7 @@ class WearerTour:
     unrest: float = 0.5  #: Nm by which what holds the arm may differ between two visits of a pose: breathing, 3.5 times
     samples: int = 200  #: poses of the comfortable range in which the error of the torque is taken
     same_pose: float = 0.05  #: rad, within which two poses are visits of one
-
-
-@dataclass(frozen=True)
-class WearerPrior:
-    """What is known of a person's relaxed arm before a pose is measured, as standard errors, and what is plausible."""
-
+    # Before a pose is measured, as standard errors; and what is plausible.
     share: float = 0.5  #: of a moment by the table: masses and places of segments
     moment: float = 0.03  #: kg m, in addition: 1.5 kg that lie 2 cm beside their link
     stiffness: float = 1.5  #: Nm/rad, of a relaxed shoulder or elbow
@@ -499,7 +494,7 @@ class WearerPrior:
     reach: tuple[float, float] = (0.2, 1.2)  #: rad, least and most of that way
 
 
-WEARER, PRIOR = WearerTour(), WearerPrior()
+WEARER = WearerTour()
 
 
 class WornArm:
@@ -523,8 +518,8 @@ class WornArm:
         if not self.is_known and model.is_described:
             expected = "the wearer's, in kg, or wearer.mass and wearer.cog: they also give the inertia"
             raise ParameterError(f"{arm.namespace}/compensator wearer.body_mass", values["wearer.body_mass"], expected)
-        self.whose = "the file's wearer" if self.is_known else f"a wearer of {PRIOR.body_mass:g} kg"
-        assumed = {} if self.is_known else {"wearer.body_mass": PRIOR.body_mass}
+        self.whose = "the file's wearer" if self.is_known else f"a wearer of {WEARER.body_mass:g} kg"
+        assumed = {} if self.is_known else {"wearer.body_mass": WEARER.body_mass}
         mass, cog = (np.array(part) for part in wearer_of({**values, **assumed}, robot.length))
         self.changes = {"tour.wearer_mass": mass.tolist(), "tour.wearer_cog": cog.tolist()}
         self.expected = model.moments_of(robot.with_wearer(mass, cog)) - model.moments
@@ -532,10 +527,10 @@ class WornArm:
         error, count = Unknowns.of(self.known.error, model), len(self.expected)
         self.known.start[:count] += self.expected
         self.known.least[:count], self.known.error[:] = -np.inf, EXACT
-        error.spring[:], error.offset[:] = PRIOR.stiffness, PRIOR.middle
-        error.moment[:] = PRIOR.share * np.abs(self.expected) + PRIOR.moment
+        error.spring[:], error.offset[:] = WEARER.stiffness, WEARER.middle
+        error.moment[:] = WEARER.share * np.abs(self.expected) + WEARER.moment
         home, low, high = np.array(arm.limits.home), arm.low, arm.high
-        down, up = (np.clip(PRIOR.of_range * way, *PRIOR.reach) for way in (home - low, high - home))
+        down, up = (np.clip(WEARER.of_range * way, *WEARER.reach) for way in (home - low, high - home))
         self.comfortable = np.array(model.comfortable or (np.maximum(low, home - down), np.minimum(high, home + up)))
 
 
@@ -568,12 +563,12 @@ def wearer_from(
     least = min(WEARER.least_poses, WEARER.least_of_one + count - 1)
     if len(observations) - again < least:
         raise DataError(f"{len(observations) - again} different poses were measured, must be at least {least}")
-    middle, spread = (theta.min(axis=0) + theta.max(axis=0)) / 2.0, np.hypot(spread, PRIOR.breathing)
+    middle, spread = (theta.min(axis=0) + theta.max(axis=0)) / 2.0, np.hypot(spread, WEARER.breathing)
     rows = rows_at(model, theta, direction)._replace(theta=theta - middle)
     own = joint_spring_of(arm.compensator)
     seen, before = effort - own.torques(theta), Unknowns.of(worn.known.error, model)
     first = solve(rows, worn.known, seen, spread)
-    absent = Unknowns.of(first.unknowns / first.error, model).spring < PRIOR.asked
+    absent = Unknowns.of(first.unknowns / first.error, model).spring < WEARER.asked
     before.spring[absent] = before.offset[absent] = EXACT
     solution = solve(rows, worn.known, seen, spread)
     changes_between = [np.ptp(solution.residual[list(pair)], axis=0) for pair in visits]
@@ -640,12 +635,12 @@ def _compared(
     moments: (k,) kg m of the wearer. rows: (m, n, k), of the poses. unsure: (n,) Nm. Raises DataError if it is no arm.
     """
     torque, table = rows @ moments, rows @ worn.expected
-    size, (low, high) = np.sqrt(np.mean(table**2, axis=0)), PRIOR.table_ratio
+    size, (low, high) = np.sqrt(np.mean(table**2, axis=0)), WEARER.table_ratio
     said, refusals = [], []
-    for n in np.flatnonzero(size > PRIOR.judged * size.max()):
+    for n in np.flatnonzero(size > WEARER.judged * size.max()):
         share = float((torque[:, n] * table[:, n]).sum() / (table[:, n] ** 2).sum())
         needs = f"{share * size[n]:.2f} +- {unsure[n]:.2f} Nm at {arm.joint_names[n]}"
-        if not share * size[n] > unsure[n] / PRIOR.largest_error:
+        if not share * size[n] > unsure[n] / WEARER.largest_error:
             raise DataError(f"the wearer's arm needs {needs}: is the arm relaxed, the robot calibrated?")
         said.append(f"{share:.0%} of the torque at {arm.joint_names[n]}")
         if worn.is_known and not low <= share <= high:

@@ -19,9 +19,9 @@ from exo_gravity.core.safety.limits import Limits
 from exo_gravity.lab.calibration.identification import fit_friction
 from exo_gravity.lab.calibration.moment_model import MomentModel
 from exo_gravity.lab.calibration.tour import (
-    CHOICE,
     DEVIATIONS,
     MAX_LEFT_OUT,
+    TOUR,
     Itinerary,
     TorqueGuess,
     Tour,
@@ -241,7 +241,7 @@ def test_poses_in_which_link_3_or_4_points_far_upwards_are_no_candidates():
     poses = np.radians(((0, 0, 0, 0), (0, 90, 0, 0), (0, 170, 90, 0), (0, 0, 0, 135), (30, 150, 0, 30)))
     expected = np.sin(np.radians((-90, 0, 0, 45, 60)))
     np.testing.assert_allclose(MODEL.upwards(poses), expected, atol=1e-12)
-    assert np.max(MODEL.upwards(candidates(LIMITS, MODEL))) <= CHOICE.most_upwards
+    assert np.max(MODEL.upwards(candidates(LIMITS, MODEL))) <= TOUR.most_upwards
 
 
 def test_what_is_expected_under_a_weight_follows_from_earlier_poses_and_is_as_sure_as_zeros_and_cables_allow():
