@@ -44,7 +44,7 @@ from exo_gravity.hardware.urdf_arm import UrdfArm
 from exo_gravity.lab.anfis import Anfis, AnfisLaw, text_of
 from exo_gravity.lab.bag.content import RECORDER
 from exo_gravity.lab.calibration.moment_model import MomentModel
-from exo_gravity.lab.calibration.tour import CALIBRATOR
+from exo_gravity.lab.calibration.tour import calibrator_table
 from exo_gravity.lab.view import ROBOT_MODEL
 from exo_gravity.panel.control import PANEL
 from exo_gravity.sim import ArmConfig
@@ -69,7 +69,7 @@ TABLES = {
     "recorder": RECORDER,
     "robot_model": ROBOT_MODEL,
     "panel": PANEL,
-    "calibrator": CALIBRATOR,
+    "calibrator": calibrator_table({}),
 }
 LIVE = [param for param in COMPENSATOR if not param.fixed]
 WRONG = (-0.1, math.nan, math.inf, 900.0, "", "heavy", True, None, [], [0.1] * 3, [0.1] * 5, [0.1, math.nan, 0.1, 0.1])

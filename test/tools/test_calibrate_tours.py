@@ -23,7 +23,7 @@ from exo_gravity.core.numbers import COVER
 from exo_gravity.core.params import values_of
 from exo_gravity.lab.calibration import recorded, tours
 from exo_gravity.lab.calibration.identification import identify
-from exo_gravity.lab.calibration.tour import CALIBRATOR, Itinerary, friction_stations, observations_in, tour_of
+from exo_gravity.lab.calibration.tour import Itinerary, calibrator_table, friction_stations, observations_in, tour_of
 from exo_gravity.lab.calibration.tours import WornArm, checked, friction_from, moments_from, wearer_from
 from exo_gravity.lab.calibration.tracking import Observation
 from exo_gravity.lab.inputs.arms import configured_arm, read_arm
@@ -76,7 +76,9 @@ def test_the_calibrator_replaces_the_compensator_and_the_tour_takes_its_paramete
     assert set(nodes) == {"/imu", "/right/can_bridge", "/right/simulator", "/right/calibrator"}
     given = nodes["/right/calibrator"]
     assert given["max_effort"] == list(ARM.limits.max_effort) and given["tour.poses"] == 3
-    assert np.all(np.isfinite(tour_of(values_of(CALIBRATOR, given)).wait((0.1, 0.2, 0.3, 0.4), Tilt.of("right"))))
+    assert np.all(
+        np.isfinite(tour_of(values_of(calibrator_table({}), given)).wait((0.1, 0.2, 0.3, 0.4), Tilt.of("right")))
+    )
 
 
 # Cables across the joints

@@ -497,9 +497,6 @@ def calibrator_table(given: Mapping[str, Any]) -> tuple[Param, ...]:
     return tuple(table_for((*own, *bridge.values(), *OWN), given))
 
 
-CALIBRATOR = calibrator_table({})  # of the paper's arm
-
-
 def side_of(values: Mapping[str, Any]) -> str:
     """Return the side of the arm that `calibrator` moves. One from a URDF has none: its root link is not mirrored."""
     return str(values.get("side", SIDES[0]))
