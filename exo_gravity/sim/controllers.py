@@ -70,11 +70,11 @@ class UnreliableController:
     change: what makes of each answer what is sent, None for the answer itself; it may raise an exception.
     """
 
-    def __init__(self, controller: Controller, clock: VirtualClock, late: float = 0.0, seed: int = 0) -> None:
+    def __init__(self, controller: Controller, clock: VirtualClock, late: float = 0.0) -> None:
         self.controller = controller
         self.delay = self.stall = 0.0
         self.change: Callable[[Efforts], Efforts] | None = None
-        self._clock, self._late, self._random = clock, late, random.Random(seed)
+        self._clock, self._late, self._random = clock, late, random.Random(0)
         self._answers: deque[tuple[float, Efforts]] = deque()  # on their way, by the time of their arrival
         self._newest = NO_EFFORTS
 

@@ -351,7 +351,8 @@ def test_registers_are_told_what_is_written_counts_until_the_power_goes_unless_i
     assert ask(motor, 99) is None
     assert motor.receive(bytes((4, 0, 0x33, 21, 0, 0, 0, 0)), 0.3, 0.0, 0.0, REGISTERS) is None  # another motor's
     for register, kind, operation, value in (
-        (PMAX, "f", 0x55, 12.566), (1, "I", 0xAA, 0), (TMAX, "f", 0x55, 20.0), (TIMEOUT, "I", 0x55, 0),
+        (PMAX, "f", 0x55, 12.566), (PMAX, "f", 0x55, -1.0), (1, "I", 0xAA, 0), (TMAX, "f", 0x55, 20.0),
+        (TIMEOUT, "I", 0x55, 0),
     ):  # fmt: skip
         ask(motor, register, kind, operation, value)
     play(motor, ENTER, DAMIAO.command(2.0, 0.0))

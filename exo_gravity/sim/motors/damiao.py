@@ -15,9 +15,11 @@ source is public (umeow0716/damiao_firmware); no motor was met:
 """
 
 import struct
+from contextlib import suppress
 from dataclasses import replace
 from typing import Any
 
+from exo_gravity.core.errors import ParameterError
 from exo_gravity.core.motors.damiao import (
     CLEAR_ERROR,
     CTRL_MODE,
@@ -127,7 +129,8 @@ class DamiaoMotor(SimulatedMotor):
             return data
         if operation == WRITE:
             (value,) = struct.unpack("<f" if number in FLOATS else "<I", data[4:])
-            self.write(number, value)
+            with suppress(ParameterError):  # a range that no motor can have changes nothing
+                self.write(number, value)
         elif operation != READ:
             return None
         value = self._registers.get(number)
