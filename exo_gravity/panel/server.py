@@ -39,6 +39,7 @@ from starlette.types import ASGIApp, Message, Receive, Scope, Send
 from starlette.websockets import WebSocket, WebSocketDisconnect
 
 from exo_gravity.core.errors import ExoGravityError, ParameterError
+from exo_gravity.lab.inputs.parameter_file import text_of
 from exo_gravity.panel.control import Control, Page
 from exo_gravity.panel.recordings import FILES, programs
 
@@ -98,7 +99,7 @@ class PanelServer:
                 ),
             ),
             Route("/settings/{arm:path}", self._on_settings),
-            Route("/parameters", lambda request: JSONResponse(control.arms.parameters())),
+            Route("/parameters", lambda request: PlainTextResponse(text_of(control.arms.parameters()))),
             WebSocketRoute("/live", self._on_live),
             Route("/login", self._on_login, methods=["GET", "POST"]),
             Mount("/static", StaticFiles(directory=FOLDER / "static")),

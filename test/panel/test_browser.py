@@ -495,6 +495,8 @@ def test_recording_trial_and_parameters_are_asked_for_and_markers_set_by_button_
     wait_for_text(page, "#trial-step", "Shoulder flexion 34°, Elbow flexion 29°")
     stage.files.content["recording"] = {"on": False, "foreign": False, "problem": "the recorder ended"}
     wait_for_text(page, "#recording-text", "The recording has ended early: the recorder ended")
+    page.click("#show")
+    wait_for_text(page, "#parameters", "depth.far: .inf")
     page.click("#save")
     wait_until(page, lambda: "save" in stage.files.calls)
     assert stage.files.calls == [

@@ -79,7 +79,7 @@ class PlayedArms:
             self.settings[name] = values_of(COMPENSATOR, {**given, "support": 0.05})
 
     def parameters(self) -> dict[str, Any]:
-        return {}
+        return {"/camera": {"depth.far": math.inf}}  # of another program; JSON has no such number
 
     def lease(self, page: str, kind: str) -> None:
         self.leases.append((page, kind))

@@ -115,10 +115,7 @@ export class Sections {
 
   async showParameters() {
     const place = byId("parameters");
-    const content = await (await fetch("/parameters")).json();
-    place.textContent = Object.entries(content)
-      .map(([node, values]) => `${node}\n${Object.entries(values).map(([name, value]) => `  ${name}: ${JSON.stringify(value)}`).join("\n")}`)
-      .join("\n\n");
+    place.textContent = await (await fetch("/parameters")).text();
     place.hidden = false;
   }
 }
