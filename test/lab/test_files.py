@@ -143,5 +143,5 @@ def test_every_item_has_one_outcome_also_when_a_process_dies():
     expected = [Outcome(item, value) for item, value in values.items()]
     expected += [Outcome(item, None, failure) for item, failure in failed.items()]
     assert sorted(found, key=lambda one: one.item) == sorted(expected, key=lambda one: one.item)
-    managers = [thread for thread in threading.enumerate() if type(thread).__name__ == "_ExecutorManagerThread"]
-    assert not managers  # no thread waits for the dead process, and keeps this one from ending
+    # No thread waits for the dead process, and keeps this one from ending.
+    assert "_ExecutorManagerThread" not in [type(thread).__name__ for thread in threading.enumerate()]

@@ -155,8 +155,11 @@ def test_ctrl_c_lets_the_arm_down_and_reports_what_was_recorded(run, monkeypatch
         return stopped
 
     monkeypatch.setattr(trial, "stop_on_signals", stop_on_signals)
-    long = {"name": "long", "steps": [SHORT["steps"][0], {"hold": 3000.0}]}
-    ended, folder = run("--offline", script=long, base="sim_both.yaml")  # the second arm is not even begun
+    ended, folder = run(
+        "--offline",
+        script={"name": "long", "steps": [SHORT["steps"][0], {"hold": 3000.0}]},
+        base="sim_both.yaml",  # the second arm is not even begun
+    )
     assert ended.code == 1 and (folder / "report.html").exists()
     assert "stopped by the operator" in ended.out and "slipped" not in ended.out
     assert "left/can_bridge: stopped by the operator" in (folder / "report.html").read_text(encoding="utf-8")
