@@ -24,9 +24,8 @@ mounting. The paper's arm has fixed axes in its closed forms, so none that are a
 is not part of its fit, but for the offsets of joints without a spring.
 
 With the Jacobian J of the torque, and the covariance C of the unknowns, the error in a new pose has the variance
-J C J^T, the part of the residuals that their stated noise does not explain, and the squares of what the file does not
-hold and of what no pose shows. A common factor of moments and torque scales is in C, however large, and cancels in J:
-it holds the arm all the same.
+J C J^T, and the squares of what the file does not hold and of what no pose shows. A common factor of moments and torque
+scales is in C, however large, and cancels in J: it holds the arm all the same.
 
 No pose shows that friction differs between the two directions, whose mean counts as gravity's torque. A gear that loses
 more while it drives its load than while it is driven makes a share of that torque look like more torque or less. How
@@ -427,7 +426,6 @@ def identify(observations: Sequence[Observation], model: MomentModel, places: Pl
     grows = np.maximum((carried * friction).sum(axis=0) / np.maximum((carried**2).sum(axis=0), EXACT), LEAST_GROWTH)
     new = new_poses(model)
     unequal = UNEQUAL * grows * new.predicted(solution.unknowns)
-    misfit = np.sqrt(np.maximum(solution.sigma**2 - spread**2, 0.0).mean(axis=0))
     tilt = slice(sum(map(len, value[:3])), sum(map(len, value[:4])))
     return Identified(
         value,
@@ -438,7 +436,7 @@ def identify(observations: Sequence[Observation], model: MomentModel, places: Pl
         solution.held_out,
         tuple(_unknown(value.moment, hidden, is_relative, model)),
         is_relative,
-        torque_error(new, solution, np.hypot(unequal, misfit)),
+        torque_error(new, solution, unequal),
     )
 
 
