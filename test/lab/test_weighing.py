@@ -87,17 +87,28 @@ def test_little_pushes_against_a_hand_that_moves_the_arm_and_not_for_long():
     assert 4.0 < pushed.max() < 9.0 and pushed[-1] == pytest.approx(0.0)  # Nm; the motor has 18
 
 
-def test_a_client_gets_2_nm_and_what_5_kg_need_until_the_settings_change():
-    compensator = Compensator(replace(SETTINGS, max_effort=(90.0,) * 4, max_effort_rate=1000.0))
+@pytest.mark.parametrize(
+    ("end", "why"),
+    [
+        (lambda compensator: compensator.apply(SETTINGS), "the settings changed"),
+        (lambda compensator: compensator.tilt.set_gravity(0.2, (0.3, 0.0, -0.95)), "the trunk turned fast"),
+    ],
+)
+def test_a_client_gets_2_nm_and_what_5_kg_need_until_the_settings_change_or_the_trunk_turns_fast(end, why):
+    compensator = Compensator(
+        replace(SETTINGS, max_effort=(90.0,) * 4, max_effort_rate=1000.0, use_imu=True, tilt_timeout=0.5)
+    )
+    compensator.tilt.set_gravity(0.0, (0.0, 0.0, -1.0))
     client = Mock(is_over=False, torque=Mock(return_value=(100.0,) * 4))
     before = compensator.step(0.0, POSE, STILL).effort
     assert compensator.lend(client) and not compensator.lend(client)
     after = [compensator.step(0.01 * cycle, POSE, STILL).effort for cycle in range(1, 20)][-1]
-    lever = np.array(SETTINGS.unit_load.torque(POSE, TILT))
-    assert np.subtract(after, before) == pytest.approx(2.0 + 5.0 * 9.80665 * np.abs(lever))
-    compensator.apply(SETTINGS)
+    assert np.subtract(after, before) == pytest.approx(
+        2.0 + 5.0 * 9.80665 * np.abs(SETTINGS.unit_load.torque(POSE, TILT))
+    )
+    end(compensator)
     compensator.step(0.2, POSE, STILL)
-    client.interrupt.assert_called_once_with("the settings changed")
+    client.interrupt.assert_called_once_with(why)
 
 
 TROUBLE = {  # the arm's poses, its velocity, and what is said of it

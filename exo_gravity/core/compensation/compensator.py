@@ -221,10 +221,12 @@ class Compensator:
         overtaken = self.tilt.overtaken if self.settings.use_imu else None
         tilts = (overtaken, self._last.tilt) if overtaken else (None,)
         loads = [Load(self.settings, self.terms.in_force, tilt) for tilt in tilts]
+        if (self._pending or overtaken) and (client := self._active_client):
+            client.interrupt("the settings changed" if self._pending else "the trunk turned fast")
         if self._pending:
             self._use(self._pending)
             return loads
-        return loads if overtaken and not self._active_client else ()
+        return loads if overtaken else ()
 
     def _held_here(self, load: Load, at: Reading) -> Torque:
         """Return the last torque (n,) in Nm as it is in the present pose: joints turn on while the trunk turns.
@@ -239,8 +241,6 @@ class Compensator:
         if settings.law != self.settings.law:
             self._fallback, self._fallback_until = "", -math.inf
         self.settings, self._pending = settings, None
-        if client := self._active_client:
-            client.interrupt("the settings changed")
         self.tilt.timeout = settings.tilt_timeout
         self.terms.apply(settings.terms, settings.moving)
 
