@@ -65,9 +65,7 @@ def test_a_late_tilt_is_extrapolated_within_the_bound_that_it_states_and_then_wi
     [(0.0, 0.0, 0.0), (0.0, 0.0, math.nan, 0.0), (math.inf, 0.0, 0.0, 0.0), (0.0, 0.0, 1e308, 1e308), (0, -27, 0, 0)],
 )
 def test_impossible_joint_angles_get_no_torque(theta):
-    run = CompensatorRun()
-    run.cycle(2.0)
-    answer = run.cycle(theta=theta)
+    answer = CompensatorRun().cycle(theta=theta)
     assert answer.effort is None
     assert "not 4 numbers within 26 rad" in answer.reason.text
 
@@ -191,18 +189,20 @@ def test_where_the_velocity_is_not_known_a_change_takes_longer_and_settings_that
     assert not run.cycle(GUIDANCE.watch + 0.2, velocity=None).remainder
 
 
-def test_a_low_limit_of_the_torques_rate_makes_no_torque_of_a_moving_arm_false():
+def test_a_low_limit_of_the_torques_rate_makes_no_torque_of_a_moving_arm_false_and_a_change_begins_from_a_limited_one():
     run = CompensatorRun(max_effort_rate=1.0)
-    run.cycle()
     for n in range(250):
         theta = np.add(THETA, n * PERIOD)
         run.cycle(theta=theta, velocity=(1.0,) * 4)
     assert run.efforts[-1] == pytest.approx(gravity_torque(ROBOT, theta), abs=1e-9)
+    run.cycle()  # elsewhere at once
+    run.compensator.apply(settings_with(max_effort_rate=1000.0))
+    run.cycle(0.1)
+    assert run.largest_step < 0.03
 
 
 def test_too_large_a_torque_is_clamped_and_the_joint_named():
-    run = CompensatorRun(max_effort=(3.0, 1.0, 3.0, 3.0))
-    answer = run.cycle(2.0)
+    answer = CompensatorRun(max_effort=(3.0, 1.0, 3.0, 3.0)).cycle(2.0)
     assert answer.effort[1] == 1.0
     assert answer.clamped == (1,)
 

@@ -104,8 +104,7 @@ class Compensator:
         self._client: Client | None = None  # the last one
         self._most_asked: Sequence[float] = ()  # (n,) Nm, that it may ask for; () before its first call
         self._pending: Settings | None = None
-        self._torque: Torque = (0.0,) * len(settings.max_effort)  # of the last step that had efforts, before the limit
-        self._effort = self._torque  # of its rate,
+        self._effort: Torque = (0.0,) * len(settings.max_effort)  # of the last step that had efforts,
         self._last = Reading(-math.inf, (), None, self.tilt.at(0.0))  # that it answers
         self._change: GuidedChange[Load] = GuidedChange(len(settings.max_effort))
         self._drop_watch, self._touch_watch = DropWatch(), TouchWatch()
@@ -168,11 +167,11 @@ class Compensator:
             change.stop()
             dt, self._effort = 0.0, torque
         elif before or bool(self._fallback) != was_replaced or (client and client.is_over):
-            held = self._held_here(before[-1], at) if before and before[-1].tilt else self._torque
+            held = self._held_here(before[-1], at) if before and before[-1].tilt else self._effort
             change.set_out(before or (None,), held, needs, torque)
         if not change.is_over:
             torque = change.follow(dt, velocity, needs, torque)
-        self._torque, self._last = torque, at
+        self._last = at
         # Over 1 rad gravity's torque changes by its amplitude: a lower limit would make that of a moving arm false.
         turn, step = sum(map(abs, velocity or ())), min(dt, LONGEST_STEP)
         self._effort = tuple([
@@ -235,7 +234,7 @@ class Compensator:
         """
         poses = at, self._last._replace(tilt=self.tilt.at(self._last.time))  # by the newest tilt, both
         here, there = (self._change.held(load, partial(self._torque_of, pose)) for pose in poses)
-        return tuple([torque + new - old for torque, new, old in zip(self._torque, here, there, strict=True)])
+        return tuple([torque + new - old for torque, new, old in zip(self._effort, here, there, strict=True)])
 
     def _use(self, settings: Settings) -> None:
         if settings.law != self.settings.law:
