@@ -413,7 +413,7 @@ def test_the_description_may_come_from_a_latched_topic_and_the_torque_begins_fro
     assert rig.commands == [] and rig.status.level == DiagnosticStatus.ERROR
     rig.effort = [0.0, 6.0, 5.0, 4.0, 3.0, 2.0, 1.0]
     rig.wait_until(lambda: rig.commands)
-    assert rig.commands[0] == pytest.approx((1.0, 2.0, 3.0, 4.0, 5.0, 6.0))
+    assert rig.commands[0] == pytest.approx(rig.node._control.applied) == (1.0, 2.0, 3.0, 4.0, 5.0, 6.0)
     carried(rig)
 
 

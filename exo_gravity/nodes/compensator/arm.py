@@ -27,7 +27,7 @@ from exo_gravity.core.trunk.inputs import TILT
 from exo_gravity.core.vocabulary import NONE, UNKNOWN, CompensatorWarning, words
 from exo_gravity.hardware.model_file import read_model
 from exo_gravity.hardware.urdf_arm import UrdfArm, arm_from, read_urdf
-from exo_gravity.nodes.ros.messages import LATE_TILT, by_name, row, to_nanoseconds, velocity_of
+from exo_gravity.nodes.ros.messages import LATE_TILT, by_name, known, row, to_nanoseconds
 from exo_gravity.nodes.ros.parameters import declare, given_to
 from exo_gravity.nodes.ros.subscriptions import LATCHED, PeriodicThread
 
@@ -162,7 +162,7 @@ class JointStateInterface:
 
     def read(self, message: JointState) -> JointReading:
         """Return positions and velocities of exactly these joints. Raises ParameterError."""
-        return by_name(message, "position", self._names), velocity_of(message, self._names)
+        return by_name(message, "position", self._names), known(message, "velocity", self._names)
 
     def send(self, now: float, message: JointState, answer: Compensation) -> JointState:
         """Publish the answer to the joint states of `message`, and return it."""
@@ -222,7 +222,7 @@ class MultiArrayInterface(PeriodicThread):
             raise ParameterError("age by its stamp", round(age, 3), f"from {-TILT.lead:g} to {self._timeout:g} s")
         if self._fade.state == "waiting":
             self._applied = by_name(message, "effort", self._names, exact=False)
-        self._velocity = velocity_of(message, self._names, exact=False)
+        self._velocity = known(message, "velocity", self._names, exact=False)
         return by_name(message, "position", self._names, exact=False), self._velocity
 
     def send(self, now: float, message: JointState, answer: Compensation) -> None:

@@ -38,7 +38,7 @@ from exo_gravity.nodes.compensator.arm import (
     warnings_of,
 )
 from exo_gravity.nodes.ros.inner import why_too_old
-from exo_gravity.nodes.ros.messages import ERROR, OK, STALE, WARN, Diagnostics, milliseconds, row, to_nanoseconds
+from exo_gravity.nodes.ros.messages import ERROR, OK, STALE, WARN, Diagnostics, known, milliseconds, row, to_nanoseconds
 from exo_gravity.nodes.ros.parameters import accept_changes
 from exo_gravity.nodes.ros.run import run
 from exo_gravity.nodes.ros.subscriptions import (
@@ -160,7 +160,7 @@ class CompensatorNode(ThreadedNode):
                 answer = Compensation(None, Status(Withdrawal.OUTPUT_FAULT, self._interface.problem))
             else:
                 with self._lock:
-                    self._control.applied = message.effort if message.name == self._names else None
+                    self._control.applied = known(message, "effort", self._names, exact=False)
                     answer = self._control.step(now, theta, velocity)
         except ParameterError as error:
             refused = self._refused(self._interface.topic, error)

@@ -57,10 +57,10 @@ def by_name(message: JointState, field: str, names: Sequence[str], exact: bool =
     return result
 
 
-def velocity_of(message: JointState, names: Sequence[str], exact: bool = True) -> tuple[float, ...] | None:
-    """Return `message`'s velocities (n,) in the order of `names`, None if they are missing or not finite."""
+def known(message: JointState, field: str, names: Sequence[str], exact: bool = True) -> tuple[float, ...] | None:
+    """Return what `by_name` does, None where that raises: if values are missing or not finite."""
     try:
-        return by_name(message, "velocity", names, exact)
+        return by_name(message, field, names, exact)
     except ParameterError:
         return None
 
