@@ -71,7 +71,7 @@ def test_a_load_of_1_kg_is_weighed_and_the_arm_stays_calm():
 def test_a_wearer_who_helps_with_one_joint_is_refused():
     weighing, _ = weigh(0.5, push=[0.0, 0.0, 2.5, 0.0], over=60.0)  # half a sine wave: nearly constant meanwhile
     assert weighing.result is None
-    assert ": no load in the hand explains " in weighing.trouble or "two turns" in weighing.trouble
+    assert ": no load in the hand explains " in weighing.trouble.text or "two turns" in weighing.trouble.text
 
 
 def test_little_pushes_against_a_hand_that_moves_the_arm_and_not_for_long():
