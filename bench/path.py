@@ -77,21 +77,21 @@ def traced_cycle() -> Trace:
     assert virtual.run_until(lambda: virtual.safety.state is State.ACTIVE), virtual.safety.waiting_for
     virtual.run(0.5)
     (bus,) = (end for end in virtual.wire.ends if isinstance(end, VirtualBus))
-    receive, send, last, seen = bus.recv, bus.send, arm.motors[-1].can_id, set[int]()
+    receive, send, last, seen = bus._recv_internal, bus.send, arm.motors[-1].can_id, set[int]()
 
-    def traced_receive(timeout: float | None = None) -> can.Message | None:
-        if message := receive(timeout):
-            seen.add(message.data[0])
+    def traced_receive(timeout: float | None = None) -> tuple[can.Message | None, bool]:
+        if (received := receive(timeout))[0]:
+            seen.add(received[0].data[0])
             if len(seen) == len(arm.motors) and not trace.calls:
                 sys.setprofile(trace.note)
-        return message
+        return received
 
     def traced_send(message: can.Message, timeout: float | None = None) -> None:
         if message.arbitration_id == last:
             sys.setprofile(None)
         send(message, timeout)
 
-    vars(bus).update(recv=traced_receive, send=traced_send)
+    vars(bus).update(_recv_internal=traced_receive, send=traced_send)
     virtual.loop.cycle()
     virtual.loop.cycle()
     virtual.loop.stop()

@@ -105,10 +105,13 @@ class CanPort:
                     raise failure from error
 
     def receive(self, timeout: float) -> can.Message | None:
-        """Return the next frame, or None if there is none within `timeout` s. Raises BusError."""
+        """Return the next frame, or None if there is none within `timeout` s, or sooner. Raises BusError.
+
+        Not by python-can's `recv`, whose time-out is by the wall clock: one that is set back would hold the loop up.
+        """
         bus = self._bus or self._reopening()
         try:
-            return bus.recv(timeout)
+            return bus._recv_internal(timeout)[0]
         except Exception as error:
             raise self._failed(bus, error) from error
 
@@ -231,8 +234,7 @@ class ArmOnBus:
         ports: list[CanPort | None] = [None] * len(self.motors)
         for part in self.parts:
             try:
-                is_fd_bus = is_fd(part.address[2])
-                port = CanPort(self.open(part.address), clock, partial(self.open, part.address), is_fd_bus)
+                port = CanPort(self.open(part.address), clock, partial(self.open, part.address), is_fd(part.address[2]))
             except BusError as error:
                 if failures is None:
                     for opened in filter(None, ports):

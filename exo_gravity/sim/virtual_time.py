@@ -248,7 +248,7 @@ class VirtualBus(can.BusABC):
         self._is_shutdown, self._has_left = True, False
 
     def deliver(self, message: can.Message) -> None:
-        """Keep a frame for `recv`."""
+        """Keep a frame until it is read."""
         clock, batch = self._wire.clock, self._wire.batch
         if batch:
             clock.later(-clock.monotonic() % batch, partial(self._received.append, message))
@@ -260,12 +260,12 @@ class VirtualBus(can.BusABC):
         self._check()
         self._wire.carry(self, msg)
 
-    def recv(self, timeout: float | None = None) -> can.Message | None:
-        """Return the next frame, None if there is none within `timeout` s."""
+    def _recv_internal(self, timeout: float | None = None) -> tuple[can.Message | None, bool]:
+        """Return the next frame, None if there is none within `timeout` s, and that it needs no filter."""
         self._check()
         if not self._received:
             self._wire.clock.run(timeout or 0.0, lambda: self._received)
-        return self._received.popleft() if self._received else None
+        return self._received.popleft() if self._received else None, True
 
     def shutdown(self) -> None:
         """Leave the wire."""

@@ -61,10 +61,13 @@ def test_settings_of_another_project_do_not_reach_a_motor_bus(tmp_path, monkeypa
 
 
 @pytest.mark.parametrize(("channel", "number"), [("0", 0), ("can0", "can0")])
-def test_a_channel_that_is_a_number_reaches_the_backend_as_one(channel, number):
+def test_a_channel_that_is_a_number_reaches_the_backend_as_one_and_no_wall_clock_delays_it(
+    channel, number, monkeypatch
+):
+    monkeypatch.setattr(can.bus, "time", pytest.fail)  # of `recv`: set back by an hour, it would wait as long
     bus, other = open_bus("virtual", channel, {}), can.Bus(interface="virtual", channel=number, ignore_config=True)
     other.send(can.Message(arbitration_id=1))
-    assert bus.recv(1.0) is not None
+    assert CanPort(bus, COMPUTER_CLOCK).receive(1.0) is not None
     bus.shutdown()
     other.shutdown()
 

@@ -425,15 +425,12 @@ def test_a_reading_is_as_old_as_the_command_that_it_answers():
 def test_a_send_that_fails_once_is_a_lost_frame_and_a_bus_that_fails_for_longer_a_fault(monkeypatch):
     arm, send = raised_usual_arm(), VirtualBus.send
 
-    def failing(*_):
-        raise OSError(105, "No buffer space available")
-
     for _ in range(10):
-        monkeypatch.setattr(VirtualBus, "send", failing)
+        monkeypatch.setattr(VirtualBus, "send", fail)
         arm.cycle()
         monkeypatch.setattr(VirtualBus, "send", send)
         arm.run(0.1)
     assert arm.state is State.ACTIVE, arm.safety.fault
-    monkeypatch.setattr(VirtualBus, "send", failing)
+    monkeypatch.setattr(VirtualBus, "send", fail)
     arm.run(0.02)
     assert (arm.state, arm.fault) == (State.LETTING_DOWN, FaultCode.BUS_ERROR)
