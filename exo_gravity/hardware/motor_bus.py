@@ -96,9 +96,9 @@ class MotorBus:
         self.motors = tuple(motors)  #: (n,)
         self._joints = frozenset(joint for joint, port in enumerate(self._ports) if port)  # on these buses
         # The ID of each motor's replies by its own ID, on each bus, for each wire format.
-        self._ids: dict[tuple[CanPort | None, WireFormat], dict[int, int]] = {}
+        self._ids: dict[CanPort | None, dict[WireFormat, dict[int, int]]] = {}
         for port, motor in zip(self._ports, motors, strict=True):
-            self._ids.setdefault((port, motor.wire_format), {})[motor.can_id] = motor.reply_id
+            self._ids.setdefault(port, {}).setdefault(motor.wire_format, {})[motor.can_id] = motor.reply_id
         self.replies = tuple([motor.wire_format.replies for motor in motors])  #: whether each (n,) replies to commands
         self._asked = frozenset(joint for joint in self._joints if self.replies[joint])
         self._joint_of = {motor.can_id: joint for joint, motor in enumerate(motors)}
@@ -142,8 +142,10 @@ class MotorBus:
         replies = self._answered & self._asked
         if self.foreign_commands or replies:
             heard = self.foreign_command or f"motor {self.motors[min(replies)].can_id} replies to another host"
-            names = " or ".join(port.name for port in self._buses)
-            raise BusError(f"CAN bus {names} is in use: {heard}; stop the other commander first")
+            raise BusError(
+                f"CAN bus {' or '.join(port.name for port in self._buses)} is in use: {heard}; "
+                "stop the other commander first"
+            )
 
     def exchange(self, command: Command, deadline: float) -> bool:
         """Send every motor its part of `command`, then collect replies until all arrived or `deadline` (s).
@@ -260,18 +262,19 @@ class MotorBus:
         if message.is_fd and not port.is_fd:
             return "FD frame", 0
         frame_id = message.arbitration_id | EXTENDED if message.is_extended_id else message.arbitration_id
-        for (own, board), reply_ids in self._ids.items():
-            if own is not port:
-                continue
+        found = "foreign frame", 0
+        for board, reply_ids in self._ids[port].items():
             kind, can_id = board.classify(frame_id, message.data, reply_ids, message.is_remote_frame)
             if kind in (COMMAND, ALIAS):
                 if port.is_echo(message):
                     return "echo", 0
                 is_obeyed = kind == COMMAND or can_id in self._aliased
                 return (FOREIGN_COMMAND, can_id) if is_obeyed else ("foreign frame", 0)
-            if kind != OTHER:
+            if kind == ELSEWHERE:  # unless it is the reply of another format's motor
+                found = kind, can_id
+            elif kind != OTHER:
                 return kind, can_id
-        return "foreign frame", 0
+        return found
 
     def _take(self, port: CanPort, message: can.Message) -> None:
         kind, can_id = self._sort(port, message)

@@ -49,7 +49,7 @@ DAMIAO_PEAK = (9.0, 18.0, 9.0, 7.0)  # Nm
 LIMIT = 0.2  # s, the time-out of the Damiao motors
 BY_NAME = {
     "damiao": ("DM-J4340", "DM-J8009", "DM-J4340", "DM-J4310"),
-    "mixed": ("AK80-9", "DM-J8009", "DM-J4340", "AK60-6"),
+    "mixed": ("DM-J8009", "AK80-9", "DM-J4340", "AK60-6"),
 }
 POSES = {
     "elbow": [1.0],
@@ -75,7 +75,11 @@ def arm_of(kind: str, **options: Any) -> CarriedArm:
     if kind in BY_NAME:
         own = [{"wire_format": MIT} if name in USUAL_MOTORS else {"wire_format": DAMIAO_MIT, "timeout": LIMIT}
                for name in BY_NAME[kind]]  # fmt: skip
-        joints = [JointMotor(MOTORS[name], n + 1, **own[n]) for n, name in enumerate(BY_NAME[kind])]
+        # AK motors 33 and 35 end like the Damiao motors 1 and 3, which are listed before them.
+        joints = [
+            JointMotor(MOTORS[name], n + 32 if name in USUAL_MOTORS else n + 1, **own[n])
+            for n, name in enumerate(BY_NAME[kind])
+        ]
         return CarriedArm(joints, [simulated(joint) for joint in joints], DAMIAO_PEAK, **options)
     firmware = replace(FIRMWARES[kind], status_rate=500.0)  # as docs/wiring.md asks for
     joints = [board(firmware, name, number) for number, name in enumerate(USUAL_MOTORS, 1)]
