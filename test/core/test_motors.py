@@ -161,12 +161,10 @@ def test_a_joint_at_rest_gets_any_effort_without_stiffness_within_its_range_or_r
     assert abs(applied - max(-spec.torque_range, min(spec.torque_range, torque))) <= slack
 
 
-def test_a_reversed_motor_has_reversed_angle_and_torque():
+def test_a_reversed_motor_has_reversed_angle_and_torque_and_one_that_is_read_at_the_end_of_its_range_is_held_there():
     motor = JointMotor(AK60, 1, direction=-1, zero=0.5, torque_scale=0.75)
-    commanded = unpack_command(AK60, motor.command(1.5, 0.0)).torque
-    assert commanded == pytest.approx(-2.0, abs=0.004)
-    reply = motor.sample(pack_reply(AK60, 1, 0.2, 1.0, commanded), 0.0)
-    assert reply[:3] == pytest.approx((0.3, -1.0, 1.5), abs=0.02)
+    assert motor.sample(pack_reply(AK60, 1, 0.2, 1.0, -2.0), 0.0)[:3] == pytest.approx((0.3, -1.0, 1.5), abs=0.02)
+    assert unpack_command(AK60, JointMotor(AK60, 1, zero=3.53).command(0.0, 0.0, 1.0, -12.5 - 3.53)).position == -12.5
 
 
 @pytest.mark.parametrize("codes_below_top", range(20))

@@ -171,8 +171,9 @@ class JointMotor:
         most = spec.torque_range
         if not -most <= torque <= most and math.isfinite(torque):
             torque = math.copysign(most, torque)
-        kp = stiffness / scale
-        return self.wire_format.pack_command(spec, self.motor_position(position) if kp else 0.0, 0.0, kp, kd, torque)
+        # A reading at the end of the range exceeds it by a rounding. NaN stays NaN.
+        angle = min(max(self.motor_position(position), -spec.position_range), spec.position_range) if stiffness else 0.0
+        return self.wire_format.pack_command(spec, angle, 0.0, stiffness / scale, kd, torque)
 
     def sample(self, data: bytes | bytearray, time: float) -> JointSample:
         """Return what a reply or status frame that arrived at `time` s says of the joint. Raises FrameError."""
@@ -354,7 +355,7 @@ class Traffic:
     def __post_init__(self) -> None:
         if not isinstance(self.bitrate, int) or not 10_000 <= self.bitrate <= 1_000_000:
             raise ParameterError("can.options.bitrate", self.bitrate, "a whole number from 10000 to 1000000 bit/s")
-        if self.data_bitrate and not self.bitrate <= self.data_bitrate <= MAX_DATA_BITRATE:
+        if self.data_bitrate and self.data_bitrate not in range(self.bitrate, MAX_DATA_BITRATE + 1):
             expected = f"a whole number from {self.bitrate}, the bit rate, to {MAX_DATA_BITRATE} bit/s"
             raise ParameterError("can.options.data_bitrate", self.data_bitrate, expected)
 
