@@ -47,7 +47,7 @@ def floats(name: str, values: Vector, count: int, low: float, high: float, unit:
     expected = f"{count} numbers from {low:g} to {high:g}{' ' + unit if unit else ''}"
     try:
         array = np.array(values, dtype=float)
-    except (TypeError, ValueError):
+    except (TypeError, ValueError, OverflowError):
         raise ParameterError(name, values, expected) from None
     # NaN fails both comparisons, so this check rejects it too.
     if array.shape != (count,) or not np.all((array >= low) & (array <= high)):
@@ -60,7 +60,7 @@ def one_float(name: str, value: float, low: float, high: float, unit: str = "") 
     """Return `value` as a float, or raise ParameterError unless it is one number in [low, high]."""
     try:
         number = float(value)
-    except (TypeError, ValueError):
+    except (TypeError, ValueError, OverflowError):
         number = math.nan
     if not low <= number <= high:
         raise ParameterError(name, value, f"a number from {low:g} to {high:g}{' ' + unit if unit else ''}")

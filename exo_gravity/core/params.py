@@ -192,13 +192,13 @@ def table_for(table: Sequence[Param], given: Mapping[str, Any]) -> Sequence[Para
 def values_of(table: Sequence[Param], given: Mapping[str, Any], free_prefix: str = "") -> dict[str, Any]:
     """Return the value of every parameter of the table by name: the given value, or the default.
 
-    Names that start with `free_prefix` and names that ROS declares are ignored. A list with one entry per joint has as
+    Names below `free_prefix` and names that ROS declares are ignored. A list with one entry per joint has as
     many as the arm has joints (`table_for`). Raises ParameterError for an invalid value and for a name that is not in
     the table.
     """
     table = table_for(table, given)
     names = {param.name for param in table}
-    prefixes = (ROS_QOS_PREFIX, free_prefix) if free_prefix else (ROS_QOS_PREFIX,)
+    prefixes = (ROS_QOS_PREFIX, f"{free_prefix}.") if free_prefix else (ROS_QOS_PREFIX,)
     for name, value in given.items():
         if name not in names and name not in ROS_PARAMETERS and not name.startswith(prefixes):
             if name in GONE:

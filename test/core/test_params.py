@@ -486,6 +486,8 @@ BUS = [
     row(fd, r"can\.options\.fd = True: must be false: a AK80-9", {}, "AK80-9"),
     row(fd, r"can\.options\.fd = True: must be false: a DM-J6006", {}, "DM-J6006"),
     row(fd, "data_bitrate = 9000000", {"data_bitrate": 9_000_000}),
+    row(fd, "data_bitrate = '5M'", {"data_bitrate": "5M"}),
+    row(values_of, "can.optionsfd = True: must be one of", CAN_BRIDGE, {"can.optionsfd": True}, "can.options"),
     row(buses_of, "can.channel = 'can0,can1': must be one channel for all motors, or 4", "can0,can1", {}, 4),
     row(buses_of, "can.channel", "can0,can0,,can1", {}, 4),
     row(buses_of, "can.options.port = .*one value, or 4", "a,a,b,b", {"port": [1, 2]}, 4),

@@ -244,8 +244,11 @@ async def nothing_first(_request):
 
 def test_a_value_that_the_check_cannot_use_is_refused_and_an_exception_where_it_is_applied_still_ends_the_node(served):
     read, apply = Mock(side_effect=[OverflowError("too large"), {"some": 2}]), Mock(side_effect=KeyError("broken"))
-    served.node.declare_parameter("some", 1)
-    accept_changes(served.node, (Param("some", 1, "a number"),), read, apply)
+    served.node.declare_parameter("can.options.port", 1)
+    table, port = (Param("some", 1, "a number"),), Parameter("can.options.port", value=2)
+    declare(served.node, table, "can.options")
+    accept_changes(served.node, table, read, apply)
+    assert "read-only parameter: can.options.port" in served.node.set_parameters_atomically([port]).reason
     some = ParameterMessage(name="some", value=ParameterValue(type=2, integer_value=2))
     request = SetParameters.Request(parameters=[some])
     (refused,) = served.answer(served.send(SetParameters, "set_parameters", request)).results

@@ -23,7 +23,7 @@ def declare(node: Node, table: Sequence[Param], free_prefix: str = "") -> dict[s
     """Declare the table's parameters on `node` and return their values by name.
 
     node: created with `automatically_declare_parameters_from_overrides=True`.
-    free_prefix: names that start with it are left as given; '' for none.
+    free_prefix: names below it are left as given, and fixed; '' for none.
 
     Raises ParameterError for an impossible value, for a name that is not in the table, and for a file without the node.
     """
@@ -32,10 +32,13 @@ def declare(node: Node, table: Sequence[Param], free_prefix: str = "") -> dict[s
         _check_file(node.get_fully_qualified_name())
     table = table_for(table, given)
     values = values_of(table, given, free_prefix)
-    for param in table:
+    free = [Param(name, given[name], "as given", fixed=True) for name in given if name.startswith(f"{free_prefix}.")]
+    for param in (*table, *free):
         if node.has_parameter(param.name):
             node.undeclare_parameter(param.name)
-        node.declare_parameter(param.name, values[param.name], descriptor_of(param), ignore_override=True)
+        node.declare_parameter(
+            param.name, values.get(param.name, param.default), descriptor_of(param), ignore_override=True
+        )
 
     set_declared = node.set_parameters_atomically
 
@@ -45,7 +48,7 @@ def declare(node: Node, table: Sequence[Param], free_prefix: str = "") -> dict[s
         for parameter in given:
             if not node.has_parameter(parameter.name):
                 try:
-                    values_of(table, {parameter.name: plain(parameter.value)}, free_prefix)
+                    values_of(table, {parameter.name: plain(parameter.value)})
                 except ParameterError as error:
                     return SetParametersResult(successful=False, reason=str(error))
             is_fixed = node.has_parameter(parameter.name) and node.describe_parameter(parameter.name).read_only
