@@ -487,6 +487,8 @@ BUS = [
     row(fd, r"can\.options\.fd = True: must be false: a DM-J6006", {}, "DM-J6006"),
     row(fd, "data_bitrate = 9000000", {"data_bitrate": 9_000_000}),
     row(fd, "data_bitrate = '5M'", {"data_bitrate": "5M"}),
+    row(JointMotor, "^torque_scale = 1000", MOTORS["AK60-6"], 1, torque_scale=10**400),
+    row(ArmModel, "^mass", *[[0.3] * 4] * 2, [10**400] * 4),
     row(values_of, "can.optionsfd = True: must be one of", CAN_BRIDGE, {"can.optionsfd": True}, "can.options"),
     row(buses_of, "can.channel = 'can0,can1': must be one channel for all motors, or 4", "can0,can1", {}, 4),
     row(buses_of, "can.channel", "can0,can0,,can1", {}, 4),
