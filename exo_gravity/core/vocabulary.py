@@ -2,8 +2,7 @@
 """The words that programs read on /diagnostics, beside the sentences for people: docs/keys.md.
 
 Each word stands once: the states and the fault codes of an arm in core/safety/command.py, those of nodes off the path
-in lab/vocabulary.py, all others here. A `Status` has a word and its sentence: what decides on a torque
-tells both at once.
+in lab/vocabulary.py, all others here. What decides on a torque tells a word and its sentence at once, in a `Status`.
 """
 
 from enum import Enum
