@@ -174,7 +174,7 @@ def test_a_wrong_parameter_ends_the_recorder_with_2_and_is_named(tmp_path):
 
 @pytest.mark.thorough
 def test_a_full_disk_ends_the_recorder_with_the_reason_and_keeps_what_fits(arm, tmp_path):
-    small = partial(resource.setrlimit, resource.RLIMIT_FSIZE, (60_000, 60_000))
+    small = partial(resource.setrlimit, resource.RLIMIT_FSIZE, (200_000, 200_000))  # chunks of up to 60,000
     # A compiled module that is cut would keep every later process of this environment from starting.
     process = start(tmp_path / "bag", preexec_fn=small, env={**os.environ, "PYTHONDONTWRITEBYTECODE": "1"})
     arm.wait_until_recorded()

@@ -90,8 +90,8 @@ class TouchWatch:
         self.time = -math.inf
         self._is_applied = False  # whether the motors apply what is asked of them, but for the brake
         self._free_for = 0.0  # s
-        # (n,): what touches the robot, and what else changes its momentum, in Nm; and the momentum without errors
-        self._touch = self._known = self._passed = np.zeros(0)
+        # (n,): what touches the robot, and what else changes its momentum, in Nm; and that momentum, kg m^2/s
+        self._touch = self._known = self._momentum = np.zeros(0)
 
     def step(
         self,
@@ -111,18 +111,18 @@ class TouchWatch:
         """
         dt = now - self.time
         if dt <= PAUSE:
-            self._passed = self._passed + dt * (self._known + self._touch)
-            self._touch = min(TOUCH.bandwidth, 1.0 / dt) * (momentum - self._passed)  # 1 / dt: stable at slow looks
+            pressing = (momentum - self._momentum) / dt - self._known
+            self._touch = self._touch + min(1.0, TOUCH.bandwidth * dt) * (pressing - self._touch)
         else:
             dt, self._touch, self._is_applied, self._free_for = 0.0, -carried, False, 0.0
-            self._passed = momentum - self._touch / TOUCH.bandwidth
-        self.time, self._known = now, known
+        self.time, self._known, self._momentum = now, known, momentum
         allowed = TOUCH.share * np.abs(carried) + TOUCH.least
         is_loaded = np.sum(np.abs(carried) >= TOUCH.heavy) >= TOUCH.joints
         is_applied = bool(is_loaded and np.all(np.abs(lacking) <= allowed))
         if speed <= (TOUCH.slow if is_applied else GUIDANCE.calm):
             self._is_applied = is_applied
         is_free = is_loaded and (self._is_applied or speed > TOUCH.slow) and np.all(np.abs(self._touch) <= allowed)
+        dt = min(dt, TOUCH.time / 3.0)  # three looks at least
         self._free_for = max(0.0, self._free_for + (dt if is_free else -0.5 * dt))  # noise is no touch
         return self._free_for >= (TOUCH.time if self._is_applied else TOUCH.fast)
 
