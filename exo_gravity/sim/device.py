@@ -78,8 +78,9 @@ class VirtualWearer:
             return nothing
         step = self.script.steps[index]
         if step.action == "move":
-            compliance = (for_joints(tuning, len(theta)) for tuning in (STIFFNESS, DAMPING, INTEGRAL))
-            stiffness, damping, integral = map(np.array, compliance)
+            stiffness, damping, integral = (
+                np.array(for_joints(tuning, len(theta))) for tuning in (STIFFNESS, DAMPING, INTEGRAL)
+            )
             position, speed = np.transpose(path_between(self._start, step.value, since, MOVING * step.duration))
             error, limit = position - theta, self.strength
             self._weight = np.clip(self._weight + integral * error * period, -limit, limit)

@@ -47,7 +47,7 @@ COMMANDS = {
 
 def _arguments(args: Sequence[str] | None) -> argparse.Namespace:
     parser = argparse.ArgumentParser(prog="calibrate", description="Find what differs between an arm and its file.")
-    parser.set_defaults(bag=None, rests=None, earlier=None)
+    parser.set_defaults(bag=None, rests=None, earlier=None, axes=None, zeros=None)
     commands = parser.add_subparsers(dest="command", required=True, metavar="COMMAND")
     for name, (_, description) in COMMANDS.items():
         command = commands.add_parser(name, help=description, description=f"calibrate {name}: {description}.")
@@ -83,13 +83,13 @@ def _arguments(args: Sequence[str] | None) -> argparse.Namespace:
                 "shows how torque_scale depends on the temperature",
             )  # fmt: skip
             option(
-                "--zeros", type=float, default=0.86, metavar="DEG",
-                help="assumed standard error of the encoders' zeros (%(default)s); 0 keeps those of a jig",
+                "--zeros", type=float, metavar="DEG",
+                help="assumed standard error of the encoders' zeros (0.86); 0 keeps those of a jig",
             )  # fmt: skip
             option(
-                "--axes", type=float, default=0.61, metavar="DEG",
+                "--axes", type=float, metavar="DEG",
                 help="assumed standard error of each joint's axis in each direction across it, by CAD or "
-                "brackets (%(default)s); of an arm from a URDF",
+                "brackets (0.61); of an arm from a URDF",
             )  # fmt: skip
     option = commands.choices[NEW].add_argument
     option("--urdf", required=True, metavar="FILE", help="description of the arm, or package://NAME/PATH")

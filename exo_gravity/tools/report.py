@@ -92,14 +92,14 @@ def _run(options: argparse.Namespace) -> int:
     given = {name: value for name in ("width", "font") if (value := getattr(options, name))}
     on_paper = html.Print(options.figures, **given)
     (path, *more), screen = options.bag, Console(stderr=True)
-    beside = path.resolve().with_name(f"{name_of(path.resolve())}_report")
+    folder = path.resolve().with_name(f"{name_of(path.resolve())}_report")
     if more or options.scheduler or (path.is_dir() and cohort.recordings_below(path) not in ([], [path])):
-        return _run_cohort(options, criteria, on_paper, Path(options.output or beside))
+        return _run_cohort(options, criteria, on_paper, Path(options.output or folder))
     clip = video.requested(options.video, options.video_speed)
     with screen.status(f"reading {path.name}"):
         bag = read_bag(path, options.decimate)
     report = trial_report.analyse(bag, criteria, options.min_hold)
-    output, part = Path(options.output or beside), Part(options.joints, options.start, options.end)
+    output, part = Path(options.output or folder), Part(options.joints, options.start, options.end)
     written = sorted([*_export(options, output, lambda: [bag]), *trial_report.write(report, output, on_paper, part)])
     if clip:
         clip(bag, screen)

@@ -33,10 +33,8 @@ from exo_gravity.tools.cli import command, extras
 
 def _run(options: argparse.Namespace) -> int:
     """Run and report a trial; return the exit code. Raises ExoGravityError."""
-    params, clip = (
-        Path(options.params or packaged_config("sim.yaml")),
-        video.requested(options.video, options.video_speed),
-    )
+    params = Path(options.params or packaged_config("sim.yaml"))
+    clip = video.requested(options.video, options.video_speed)
     from rich.console import Console
 
     from exo_gravity.lab.bag.reader import read_bag

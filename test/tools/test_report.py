@@ -145,9 +145,9 @@ def test_the_report_is_written_next_to_its_recording_and_on_request_time_series_
     assert {path.name for path in short_bag.with_name("short_1.2_report").iterdir()} == {
         *("holds.csv", "motions.csv", "report.html", "report.json", "right_drift.png", "right_overview.png")
     }
-    beside = short_bag.with_name("short_1.2_report")
-    assert run_tool("report", short_bag, "--min-hold", "99").code == 1 and "never still" in page_in(beside).text
-    assert {path.name for path in beside.iterdir()} == {"report.html", "report.json", "right_overview.png"}  # no others
+    folder = short_bag.with_name("short_1.2_report")
+    assert run_tool("report", short_bag, "--min-hold", "99").code == 1 and "never still" in page_in(folder).text
+    assert {path.name for path in folder.iterdir()} == {"report.html", "report.json", "right_overview.png"}  # no others
     nowhere = run_tool("report", short_bag, "--output", short_bag / "metadata.yaml" / "report")
     assert nowhere.code == 2 and "cannot write the report there" in nowhere.err
     assert [

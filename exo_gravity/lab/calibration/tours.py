@@ -234,9 +234,12 @@ def _knowing(record: Path | None) -> dict[str, Any]:
 
 
 def places_of(options: argparse.Namespace) -> Places:
-    """Return how exactly zeros and axes are known, both in degrees. Raises ParameterError."""
-    known = (("zeros", options.zeros), ("axes", options.axes))
-    return Places(*(math.radians(one_float(name, one, 0.0, MOST_OFF, "degrees")) for name, one in known))
+    """Return how exactly zeros and axes are known, as usual where no option says it. Raises ParameterError."""
+    known = zip(("zeros", "axes"), (options.zeros, options.axes), AS_USUAL, strict=True)
+    return Places(*(
+        usual if given is None else math.radians(one_float(name, given, 0.0, MOST_OFF, "degrees"))
+        for name, given, usual in known
+    ))  # fmt: skip
 
 
 def tour_observations(
@@ -481,7 +484,7 @@ class WearerTour:
     same_pose: float = 0.05  #: rad, within which two poses are visits of one
     # Before a pose is measured, as standard errors; and what is plausible.
     share: float = 0.5  #: of a moment by the table: masses and places of segments
-    moment: float = 0.03  #: kg m, in addition: 1.5 kg that lie 2 cm beside their link
+    moment: float = 0.03  #: kg m, in addition: 1.5 kg whose centre lies 2 cm off the link's axis
     stiffness: float = 1.5  #: Nm/rad, of a relaxed shoulder or elbow
     middle: float = 1.0  #: Nm, of its torque in the middle of the poses
     asked: float = 2.2  #: standard errors beyond which a spring is one; its square is ln of 120 efforts
