@@ -105,7 +105,7 @@ class CanPort:
                     raise failure from error
 
     def receive(self, timeout: float) -> can.Message | None:
-        """Return the next frame, or None if there is none within `timeout` s, or sooner. Raises BusError.
+        """Return the next frame, or None: after `timeout` s at the latest. Raises BusError.
 
         Not by python-can's `recv`, whose time-out is by the wall clock: one that is set back would hold the loop up.
         """

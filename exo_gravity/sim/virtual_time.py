@@ -261,7 +261,7 @@ class VirtualBus(can.BusABC):
         self._wire.carry(self, msg)
 
     def _recv_internal(self, timeout: float | None = None) -> tuple[can.Message | None, bool]:
-        """Return the next frame, None if there is none within `timeout` s, and that it needs no filter."""
+        """Return the next frame, or None after `timeout` s; and True, because there is no filter."""
         self._check()
         if not self._received:
             self._wire.clock.run(timeout or 0.0, lambda: self._received)

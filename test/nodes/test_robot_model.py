@@ -122,7 +122,7 @@ def test_a_viewer_gets_the_description_the_joint_states_of_both_arms_and_markers
     viewer.wait_until(lambda: viewer.statuses["robot_model"].message == "no messages on /left/joint_states")
     arm = viewer.model._arms["/right"]
     arm.describe({**arm._parameters[0], "link_length": [-1.0] * 4}, arm._parameters[1])  # by a restart
-    assert arm.view({}) is None and "length" in arm.problem  # the last description is not shown on
+    assert arm.view({}) is None and "length" in arm.problem  # the last description is no longer shown
 
 
 # The layouts of RViz, PlotJuggler and Foxglove, and the launch file: what they name exists. The viewers have no wheels

@@ -51,7 +51,7 @@ class Skeleton(NamedTuple):
     axes: np.ndarray  #: (n, 3), unit vectors along the joints' axes while all angles are 0; (0, 3): the paper's
     ways: np.ndarray  #: (n, 3), unit vectors along the links, zeros for one without length; (0, 3): the paper's
     moments: np.ndarray  #: (n,) kg m, largest first moment along each link, with all mass beyond it
-    beside: np.ndarray  #: (n,) kg m, bound on the first moment, about each joint, of the mass off the links' axes
+    beside: np.ndarray  #: (n,) kg m, bound on the first moment about each joint of mass that lies off the links' axes
 
 
 class Links(Protocol):

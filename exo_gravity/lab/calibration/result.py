@@ -5,8 +5,8 @@ The new file is a copy of the old one in which everything else stays as it is, c
 is replaced in the text, at the place that PyYAML's parser reports. A line above it says when it was measured, and how
 exactly. The copy is read again before it is kept: it must differ in the new values only.
 
-The page shows the torque that remains beside the friction. An arm whose torque is wrong by less than the friction of a
-joint stays where it is. Beyond it creeps, until a viscous torque balances the rest.
+The page compares the torque that the fit leaves with each joint's friction. An arm whose torque is wrong by less than
+that stays where it is. With more it creeps, until viscous friction balances the rest.
 """
 
 import datetime

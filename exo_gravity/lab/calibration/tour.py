@@ -6,9 +6,8 @@ gravity, half of the difference is friction. The next pose is a given one, or th
 can hold. What holds the arm is expected with a mean and a standard deviation for every pose: by the fit of what this
 tour, and earlier ones, have measured so far. That carries the arm, and distinguishes a hand on it from its weight.
 
-A pose in which a joint sticks is left out. The tour begins and ends at
-the hanging arm; after trouble it withdraws its efforts. Its record has one line of JSON for each pose, as `calibrator`
-prints it.
+A pose in which a joint sticks is left out. The tour begins and ends at the hanging arm; after trouble it withdraws its
+efforts. Its record has one line of JSON for each pose, as `calibrator` prints it.
 """
 
 import json

@@ -3,7 +3,7 @@
 
 Each service runs on the control thread between two cycles, and the executor does not wait for it: a request to let the
 arm down never waits behind others, and ends those that would arm it. A request that would arm the arm is refused once
-it is older than REQUEST_LIFE: whoever sent it no longer expects it to be carried out. One that lets the arm down is
+it is older than REQUEST_LIFE: its sender no longer expects it to be carried out. One that lets the arm down is
 carried out at any age. Who holds control is a lease (core/safety/lease.py).
 """
 

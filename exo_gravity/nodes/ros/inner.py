@@ -104,7 +104,7 @@ class NodeExecutor(SingleThreadedExecutor):
 def why_too_old(node: Node) -> str:
     """Return why the request that `node` is answering is too old to move an arm; '' if it is not, or that is not known.
 
-    Whoever sent it no longer expects it to be carried out.
+    Its sender no longer expects it to be carried out.
     """
     age = getattr(node.executor, "request_age", 0.0)
     if age <= REQUEST_LIFE:

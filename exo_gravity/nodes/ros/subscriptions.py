@@ -75,7 +75,7 @@ class PeriodicThread:
 
 
 class ThreadedNode(Node):
-    """A node with `threads` beside its executor, which `run` ends."""
+    """A node that also works on `threads` of its own; `run` ends it when one of them fails."""
 
     def __init__(self, *args: Any, **options: Any) -> None:
         super().__init__(*args, **options)
